@@ -1,0 +1,137 @@
+"""Unit quaternions and rotation matrices (Sola, Quaternion kinematics for the error-state Kalman filter).
+
+A quaternion is (w, x, y, z), Hamilton, and turns body coordinates into ``map`` coordinates. Compiled functions take
+and return tuples, so that nothing is allocated; a 3x3 matrix is a tuple of three row tuples or an array.
+"""
+
+from __future__ import annotations
+
+import math
+
+from eskf_ros.compiled import njit
+
+
+@njit
+def cross(a, b):
+    """Return the cross product of two 3-vectors."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+@njit
+def multiply(a, b):
+    """Return the Hamilton product of two quaternions (Sola, eq. 12)."""
+    return (
+        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+    )
+
+
+@njit
+def normalized(q):
+    """Return the quaternion scaled to unit length."""
+    scale = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    return (q[0] * scale, q[1] * scale, q[2] * scale, q[3] * scale)
+
+
+@njit
+def from_rotation_vector(v):
+    """Return the quaternion that turns by the rotation vector ``v`` (rad; Sola, eq. 101), exact near zero too."""
+    angle2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    if angle2 < 1e-8:
+        half_sinc = 0.5 - angle2 / 48.0
+        return (1.0 - angle2 / 8.0 + angle2 * angle2 / 384.0, v[0] * half_sinc, v[1] * half_sinc, v[2] * half_sinc)
+    angle = math.sqrt(angle2)
+    half_sinc = math.sin(0.5 * angle) / angle
+    return (math.cos(0.5 * angle), v[0] * half_sinc, v[1] * half_sinc, v[2] * half_sinc)
+
+
+@njit
+def to_rotation_vector(q):
+    """Return the rotation vector (rad) of a unit quaternion, its length at most pi (Sola, eq. 103)."""
+    sign = 1.0 if q[0] >= 0.0 else -1.0
+    sine = math.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    scale = 2.0 * sign
+    if sine > 1e-12:
+        scale = 2.0 * math.atan2(sign * sine, sign * q[0]) / sine
+    return (q[1] * scale, q[2] * scale, q[3] * scale)
+
+
+@njit
+def to_matrix(q):
+    """Return the rotation matrix of a unit quaternion as three row tuples (Sola, eq. 115)."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    return (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+
+
+@njit
+def rotate(rotation, v):
+    """Return rotation matrix times vector."""
+    return (
+        rotation[0][0] * v[0] + rotation[0][1] * v[1] + rotation[0][2] * v[2],
+        rotation[1][0] * v[0] + rotation[1][1] * v[1] + rotation[1][2] * v[2],
+        rotation[2][0] * v[0] + rotation[2][1] * v[1] + rotation[2][2] * v[2],
+    )
+
+
+@njit
+def rotate_back(rotation, v):
+    """Return transposed rotation matrix times vector."""
+    return (
+        rotation[0][0] * v[0] + rotation[1][0] * v[1] + rotation[2][0] * v[2],
+        rotation[0][1] * v[0] + rotation[1][1] * v[1] + rotation[2][1] * v[2],
+        rotation[0][2] * v[0] + rotation[1][2] * v[1] + rotation[2][2] * v[2],
+    )
+
+
+@njit
+def from_roll_pitch_yaw(roll, pitch, yaw):
+    """Return the quaternion of fixed-axis roll, pitch, yaw (rad): Rz(yaw) Ry(pitch) Rx(roll), as in REP-103."""
+    cr, sr = math.cos(0.5 * roll), math.sin(0.5 * roll)
+    cp, sp = math.cos(0.5 * pitch), math.sin(0.5 * pitch)
+    cy, sy = math.cos(0.5 * yaw), math.sin(0.5 * yaw)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+@njit
+def to_roll_pitch_yaw(q):
+    """Return fixed-axis roll, pitch, yaw (rad) of a unit quaternion; pitch within +-pi/2."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    sine = 2.0 * (w * y - x * z)
+    return (
+        math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
+        math.asin(max(-1.0, min(1.0, sine))),
+        math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
+    )
+
+
+@njit
+def left_jacobian(v):
+    """Return the left Jacobian of SO(3) at rotation vector ``v`` as three row tuples (Sola, eq. 145).
+
+    log(exp(v + d) exp(-v)) = J d to first order in d: what resets the error state after ``v`` has been injected.
+    """
+    angle2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    if angle2 < 1e-8:
+        a = 0.5 - angle2 / 24.0
+        b = 1.0 / 6.0 - angle2 / 120.0
+    else:
+        angle = math.sqrt(angle2)
+        a = (1.0 - math.cos(angle)) / angle2
+        b = (angle - math.sin(angle)) / (angle2 * angle)
+    x, y, z = v[0], v[1], v[2]
+    return (
+        (1.0 - b * (y * y + z * z), -a * z + b * x * y, a * y + b * x * z),
+        (a * z + b * x * y, 1.0 - b * (x * x + z * z), -a * x + b * y * z),
+        (-a * y + b * x * z, a * x + b * y * z, 1.0 - b * (x * x + y * y)),
+    )
