@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from eskf_ros import rotation
 from eskf_ros.simulate.map_frame import MapFrame
-from eskf_ros.simulate.trajectory import DriveTrajectory
+from eskf_ros.simulate.trajectory import DriveTrajectory, cross
 
 Array = NDArray[np.float64]
 
@@ -59,7 +59,7 @@ _MEAN_NODES, _MEAN_WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 
 def grade_parameters(grade: str) -> dict[str, float]:
-    """Return the estimator's ``imu.*`` noise parameters that describe ``grade``; ValueError names the grades there are."""
+    """Return the estimator's ``imu.*`` noise parameters for ``grade``; ValueError names the grades there are."""
     if grade not in GRADES:
         raise ValueError(f"unknown IMU grade '{grade}'; there are {', '.join(GRADES)}")
     return dict(GRADES[grade])
@@ -89,8 +89,8 @@ def ideal_samples(
     """
     mount = mount or ImuMount()
     motion = trajectory.motion(times)
-    body_to_map = motion.rotation_body_to_map()
-    coriolis = 2.0 * np.cross(frame.earth_rate_map, motion.velocity_of(mount.position))
+    body_to_map = motion.rotation_body_to_map
+    coriolis = 2.0 * cross(frame.earth_rate_map, motion.velocity_of(mount.position))
     gravity = frame.gravity_map(motion.position_of(mount.position))
     force_map = motion.acceleration_of(mount.position) + coriolis - gravity
     force_body = np.einsum("nji,nj->ni", body_to_map, force_map)

@@ -64,7 +64,7 @@ def east_north_up_to_ecef(geodetic: Array) -> Array:
 
 
 @njit
-def _gravity_ecef(position_ecef):
+def _gravity_ecef(position_ecef: Array) -> Array:
     gravity = np.empty_like(position_ecef)
     for i in range(position_ecef.shape[0]):
         x, y, z = earth.normal_gravity_ecef(position_ecef[i, 0], position_ecef[i, 1], position_ecef[i, 2])
@@ -75,7 +75,7 @@ def _gravity_ecef(position_ecef):
 
 
 @njit
-def _to_geodetic(position_ecef):
+def _to_geodetic(position_ecef: Array) -> Array:
     geodetic = np.empty_like(position_ecef)
     for i in range(position_ecef.shape[0]):
         latitude, longitude, altitude = earth.ecef_to_geodetic(

@@ -175,11 +175,11 @@ class Options:
 class Recording:
     """What the sensors gave, when it arrived, and the truth.
 
-    Stamps and arrivals (``*_arrival``: log time) are int64 ns; arrays of one sensor have one row per message. Covariances
-    are row-major (n, 9). The truth is of base_link: position and velocity in ``map`` (m, m/s), attitude as quaternion
+    Stamps and arrivals (``*_arrival``: log time) are int64 ns; arrays of one sensor have one row per message.
+    Covariances are row-major (n, 9). The truth is of base_link: position and velocity in ``map`` (m, m/s), attitude as quaternion
     w x y z, ``truth_angular_rate_body`` relative to the Earth in base_link axes (rad/s). ``gyro_bias`` and
     ``accel_bias`` (one row per IMU sample, IMU axes) are what the ideal samples were shifted by. ``datum``: latitude
-    and longitude in degrees, ellipsoidal altitude in m. These arrays are shared between recordings: do not write to them.
+    and longitude in degrees, ellipsoidal altitude in m. Recordings share these arrays: do not write.
     """
 
     name: str
@@ -369,11 +369,11 @@ def _noise_free(name: str, options: Options) -> _NoiseFree:
     )
 
 
-def _nanoseconds(seconds: Array) -> Stamps:
+def _nanoseconds(seconds: NDArray[np.floating[Any]]) -> Stamps:
     return np.round(seconds * 1e9).astype(np.int64)
 
 
 def _arrivals(stamps: Stamps, delay: tuple[float, float], stream: np.random.Generator) -> Stamps:
-    """Return stamps plus delays uniform between the two (s). A link keeps the order: what is held up holds up the next."""
+    """Return stamps plus delays, uniform between the two (s), in order: what is held up holds up what comes after."""
     delays = _nanoseconds(stream.uniform(delay[0], delay[1], len(stamps)))
     return np.maximum.accumulate(stamps + delays)
