@@ -38,9 +38,10 @@ def integrate(
 ) -> MapState:
     """Integrate a body from ``times[0]`` and return its state at all of ``times`` (increasing, s).
 
-    ``inputs(t)`` gives specific force (m/s2) and angular rate relative to inertial space (rad/s), both (3,) in body axes.
-    ``start``: position (m), velocity (m/s), attitude w x y z at ``times[0]``, in ``map``. ``datum``: latitude, longitude
-    (deg), ellipsoidal altitude (m). ``breakpoints``: times at which a derivative of the inputs jumps; no step crosses one.
+    ``inputs(t)`` gives specific force (m/s2) and angular rate relative to inertial space (rad/s), (3,) in body axes.
+    ``start``: position (m), velocity (m/s), attitude w x y z at ``times[0]``, in ``map``. ``datum``: latitude and
+    longitude (deg), ellipsoidal altitude (m). ``breakpoints``: times at which a derivative of the inputs jumps; no
+    step crosses one.
     """
     times = np.asarray(times, dtype=np.float64)
     origin = np.array(earth.geodetic_to_ecef(math.radians(datum[0]), math.radians(datum[1]), datum[2]))
@@ -57,7 +58,7 @@ def integrate(
     position_ecef = origin + map_to_ecef @ position_map
     velocity_inertial = map_to_ecef @ velocity_map + np.cross(spin, position_ecef)
 
-    # What is integrated is the departure from uniform motion: its few kilometres keep the digits that 6400 km would cost.
+    # What is integrated is the departure from uniform motion: a few kilometres keep the digits that 6400 km would cost.
     def uniform(t: float) -> Array:
         return position_ecef + velocity_inertial * (t - begin)
 

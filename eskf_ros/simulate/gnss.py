@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +41,10 @@ class Epochs:
 
 
 def ideal_epochs(
-    trajectory: DriveTrajectory, frame: MapFrame, times: Array, lever_arm: tuple[float, float, float]
+    trajectory: DriveTrajectory,
+    frame: MapFrame,
+    times: NDArray[np.floating[Any]],
+    lever_arm: tuple[float, float, float],
 ) -> IdealEpochs:
     """Return the error-free antenna, at ``lever_arm`` (m) in base_link, at ``times`` (n,) in seconds."""
     motion = trajectory.motion(times)
@@ -58,7 +62,7 @@ def measure(
     velocity_std: tuple[float, float],
     seed: np.random.SeedSequence,
 ) -> Epochs:
-    """Return the epochs with white errors of ``position_std`` (m) and ``velocity_std`` (m/s), horizontal and vertical."""
+    """Return the epochs with white errors of the given standard deviations (m, m/s), each horizontal and vertical."""
     position_stream, velocity_stream = (np.random.Generator(np.random.PCG64(s)) for s in seed.spawn(2))
     shape = ideal.position_ecef.shape
     position_error = position_stream.standard_normal(shape) * axis_stds(position_std)

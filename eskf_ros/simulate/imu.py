@@ -24,27 +24,27 @@ from eskf_ros.simulate.trajectory import DriveTrajectory, cross
 Array = NDArray[np.float64]
 
 GRADES: dict[str, dict[str, float]] = {
-    # Telephone and hobby sensors without calibration over temperature.
+    # Telephone and hobby sensors; also what the estimator assumes by default.
     "consumer": {
-        "imu.gyro_noise_density": 1.2e-4,
+        "imu.gyro_noise_density": 2.0e-4,
         "imu.accel_noise_density": 2.0e-3,
         "imu.gyro_bias_random_walk": 1.0e-5,
         "imu.accel_bias_random_walk": 2.0e-4,
         "imu.gyro_bias_std": 1.0e-2,
         "imu.accel_bias_std": 2.0e-1,
     },
-    # Calibrated MEMS units of robots and machines.
+    # MEMS units of robots and machines, calibrated over temperature.
     "industrial": {
-        "imu.gyro_noise_density": 7.0e-5,
-        "imu.accel_noise_density": 8.0e-4,
-        "imu.gyro_bias_random_walk": 1.0e-6,
-        "imu.accel_bias_random_walk": 2.0e-5,
+        "imu.gyro_noise_density": 5.0e-5,
+        "imu.accel_noise_density": 6.0e-4,
+        "imu.gyro_bias_random_walk": 2.0e-6,
+        "imu.accel_bias_random_walk": 5.0e-5,
         "imu.gyro_bias_std": 3.0e-3,
         "imu.accel_bias_std": 5.0e-2,
     },
-    # High-end MEMS and small fibre-optic units.
+    # The best MEMS and small fibre-optic units.
     "tactical": {
-        "imu.gyro_noise_density": 1.5e-5,
+        "imu.gyro_noise_density": 1.0e-5,
         "imu.accel_noise_density": 3.0e-4,
         "imu.gyro_bias_random_walk": 1.0e-7,
         "imu.accel_bias_random_walk": 3.0e-6,

@@ -176,10 +176,11 @@ class Recording:
     """What the sensors gave, when it arrived, and the truth.
 
     Stamps and arrivals (``*_arrival``: log time) are int64 ns; arrays of one sensor have one row per message.
-    Covariances are row-major (n, 9). The truth is of base_link: position and velocity in ``map`` (m, m/s), attitude as quaternion
-    w x y z, ``truth_angular_rate_body`` relative to the Earth in base_link axes (rad/s). ``gyro_bias`` and
-    ``accel_bias`` (one row per IMU sample, IMU axes) are what the ideal samples were shifted by. ``datum``: latitude
-    and longitude in degrees, ellipsoidal altitude in m. Recordings share these arrays: do not write.
+    Covariances are row-major (n, 9), in m2 and m2/s2; GNSS velocity and both covariances are in east, north, up at the
+    antenna. The truth is of base_link: position and velocity in ``map`` (m, m/s), attitude as quaternion w x y z,
+    ``truth_angular_rate_body`` relative to the Earth in base_link axes (rad/s). ``gyro_bias`` and ``accel_bias`` (one
+    row per IMU sample, IMU axes) are the true biases. ``datum``: latitude and longitude in degrees, ellipsoidal
+    altitude in m. Recordings of one scenario share the arrays that do not depend on the seed: do not write to them.
     """
 
     name: str
