@@ -437,7 +437,7 @@ class Leaf:
     def _number(self, value: object, index: int) -> float | None:
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             return None
-        if math.isnan(value):
+        if value != value:  # NaN; math.isnan fails for integers beyond the range of floats
             # One object for all: two parameter sets that differ in nothing then compare equal.
             return math.nan if self.rule.nan_allowed else None
         rule = self.rule

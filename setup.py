@@ -1,0 +1,60 @@
+"""Build of eskf_ros, for colcon (ament_python) and for plain pip alike."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+package_name = "eskf_ros"
+
+setup(
+    name=package_name,
+    version="0.1.0",
+    description="Error-state Kalman filter fusing an IMU with GNSS: ROS 2 navigation and replay of recordings",
+    author="eskf_ros maintainers",
+    maintainer="eskf_ros maintainers",
+    maintainer_email="maintainers@example.org",
+    license="Apache-2.0",
+    packages=find_packages(include=[package_name, f"{package_name}.*"]),
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
+        (f"share/{package_name}", ["package.xml"]),
+        (f"share/{package_name}/config", sorted(glob("config/*.yaml"))),
+        (f"share/{package_name}/bags", sorted(glob("bags/*.mcap"))),
+    ],
+    python_requires=">=3.10",
+    install_requires=[
+        "numpy>=1.26",
+        "scipy>=1.11",
+        "numba>=0.58",
+        "pyyaml",
+        "rosbags",
+        "lz4",
+        "mcap",
+        "rich",
+        "zstandard",
+        "matplotlib",
+    ],
+    extras_require={
+        # Jazzy from PyPI: Linux on x86-64 only. Elsewhere, or beside /opt/ros, use the ROS installation instead.
+        "ros": [
+            "ros-jazzy-rclpy; sys_platform == 'linux' and platform_machine == 'x86_64'",
+            "ros-jazzy-common-interfaces; sys_platform == 'linux' and platform_machine == 'x86_64'",
+            "ros-rclpy[fastrtps]==7.1.6; sys_platform == 'linux' and platform_machine == 'x86_64'",
+        ],
+        "test": [
+            "gtsam",
+            "hypothesis",
+            "mypy",
+            "pymap3d",
+            "pytest",
+            "ruff",
+        ],
+    },
+    entry_points={
+        "console_scripts": [
+            "eskf_replay = eskf_ros.replay.main:main",
+            "eskf_simulate = eskf_ros.simulate.main:main",
+        ],
+    },
+    zip_safe=True,
+)

@@ -1,0 +1,150 @@
+"""What the package says about itself agrees, and what it promises exists."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+import subprocess
+import sys
+import xml.etree.ElementTree
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+import eskf_ros
+
+CHECKOUT = Path(__file__).resolve().parent.parent
+# Import name -> name in package indices, where they differ.
+DISTRIBUTIONS = {"yaml": "pyyaml"}
+# Import name -> rosdep key that brings it, where it is not python3-NAME.
+ROSDEP_KEYS = {"rosbags": "python3-rosbags-pip", "mcap": "mcap-ros2-support", "lz4": "mcap-ros2-support"}
+ROSDEP_KEYS["zstandard"] = "mcap-ros2-support"
+
+
+class SetupArguments(dict[str, object]):
+    """The literal keyword arguments of the setup() call in setup.py."""
+
+    def __init__(self) -> None:
+        module = ast.parse((CHECKOUT / "setup.py").read_text(encoding="utf-8"))
+        call = next(
+            node for node in ast.walk(module) if isinstance(node, ast.Call) and ast.unparse(node.func) == "setup"
+        )
+        super().__init__()
+        for keyword in call.keywords:
+            try:
+                self[str(keyword.arg)] = ast.literal_eval(keyword.value)
+            except ValueError:
+                self[str(keyword.arg)] = ast.unparse(keyword.value)
+
+
+SETUP = SetupArguments()
+PACKAGE_XML = xml.etree.ElementTree.parse(CHECKOUT / "package.xml").getroot()
+
+
+def third_party_imports() -> set[str]:
+    """Top-level names of everything imported in the package that neither Python nor the package itself brings."""
+    names: set[str] = set()
+    for path in (CHECKOUT / "eskf_ros").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                names |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+                names.add(node.module.split(".")[0])
+    return names - set(sys.stdlib_module_names) - {"eskf_ros"}
+
+
+def test_one_version_everywhere() -> None:
+    assert SETUP["version"] == eskf_ros.__version__
+    assert PACKAGE_XML.findtext("version") == eskf_ros.__version__
+    changelog = (CHECKOUT / "CHANGELOG.rst").read_text(encoding="utf-8")
+    newest = re.search(r"^(\d+\.\d+\.\d+) \(\d{4}-\d\d-\d\d\)$", changelog, re.MULTILINE)
+    assert newest is not None
+    assert newest.group(1) == eskf_ros.__version__
+
+
+def test_installed_version() -> None:
+    try:
+        installed = metadata.version("eskf_ros")
+    except metadata.PackageNotFoundError:
+        pytest.skip("eskf_ros is not installed here, only on the path")
+    assert installed == eskf_ros.__version__
+
+
+def test_names_and_licence_agree() -> None:
+    assert PACKAGE_XML.findtext("name") == eskf_ros.__name__
+    assert PACKAGE_XML.findtext("export/build_type") == "ament_python"
+    assert PACKAGE_XML.findtext("license") == SETUP["license"] == "Apache-2.0"
+    assert "Apache License" in (CHECKOUT / "LICENSE").read_text(encoding="utf-8")
+    assert (CHECKOUT / "resource" / eskf_ros.__name__).is_file()
+
+
+def test_every_import_is_declared_for_pip_and_for_rosdep() -> None:
+    required = {re.split(r"[<>=\[; ]", line)[0] for line in SETUP["install_requires"]}  # type: ignore[attr-defined]
+    keys = {element.text for element in PACKAGE_XML.findall("exec_depend")}
+    for name in third_party_imports():
+        assert DISTRIBUTIONS.get(name, name) in required, f"{name} is imported, but setup.py does not require it"
+        key = ROSDEP_KEYS.get(name, f"python3-{name}")
+        assert key in keys, f"{name} is imported, but package.xml has no exec_depend {key}"
+
+
+def entry_points() -> list[str]:
+    return list(SETUP["entry_points"]["console_scripts"])  # type: ignore[index, call-overload]
+
+
+@pytest.mark.parametrize("line", entry_points())
+def test_commands_start_and_explain_themselves(line: str) -> None:
+    _, _, target = line.partition(" = ")
+    module, _, function = target.partition(":")
+    assert callable(getattr(importlib.import_module(module), function))
+    code = f"import sys; from {module} import {function}; sys.exit({function}())"
+    result = subprocess.run([sys.executable, "-c", code, "--help"], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert "usage" in result.stdout.lower()
+
+
+def test_installed_files_exist() -> None:
+    for folder in ("config", "bags"):
+        assert f"glob('{folder}/*" in str(SETUP["data_files"])
+    assert (CHECKOUT / "config" / "eskf.yaml").is_file()
+    assert (CHECKOUT / "config" / "tunnel_drive.yaml").is_file()
+    for path in re.findall(r"'([^'*]+\.(?:xml|yaml|mcap))'", str(SETUP["data_files"])):
+        assert (CHECKOUT / path).is_file()
+
+
+def test_files_the_commands_of_run_need() -> None:
+    script = (CHECKOUT / "run").read_text(encoding="utf-8")
+    named = re.findall(r"(?:bags|config)/[\w.]+", script)
+    assert named
+    for path in named:
+        assert (CHECKOUT / path).is_file(), f"run names {path}"
+
+
+@pytest.mark.parametrize("path", ["run", ".ci/run"])
+def test_scripts_are_executable(path: str) -> None:
+    assert (CHECKOUT / path).stat().st_mode & 0o111
+    subprocess.run(["bash", "-n", CHECKOUT / path], check=True)
+
+
+def test_run_refuses_a_python_that_is_too_old(tmp_path: Path) -> None:
+    old = tmp_path / "python"
+    old.write_text('#!/bin/sh\ncase "$2" in *exit*) exit 1;; *) echo 3.8.10;; esac\n')
+    old.chmod(0o755)
+    for python, said in ((str(old), "is Python 3.8.10, 3.10 or newer"), (str(tmp_path / "none"), "no Python found")):
+        result = subprocess.run(
+            [CHECKOUT / "run", "demo"],
+            env={"PATH": "/usr/bin:/bin", "PYTHON": python},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert result.returncode == 1
+        assert said in result.stderr
+
+
+def test_run_without_a_verb_explains_itself() -> None:
+    result = subprocess.run([CHECKOUT / "run"], capture_output=True, text=True, check=False)
+    assert result.returncode == 2
+    assert "./run demo" in result.stdout
+    assert "./run test" in result.stdout
