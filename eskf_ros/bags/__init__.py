@@ -1,0 +1,22 @@
+"""Fast typed reading and writing of rosbag2 recordings. Never imported by the node."""
+
+from __future__ import annotations
+
+from eskf_ros.bags.errors import BagError
+from eskf_ros.bags.messages import MESSAGE_TYPES, StringTable, decode, encode, message_dtype
+from eskf_ros.bags.reader import BagReader, Batch, TopicInfo, open_bag
+from eskf_ros.bags.writer import BagWriter
+
+__all__ = [
+    "MESSAGE_TYPES",
+    "BagError",
+    "BagReader",
+    "BagWriter",
+    "Batch",
+    "StringTable",
+    "TopicInfo",
+    "decode",
+    "encode",
+    "message_dtype",
+    "open_bag",
+]

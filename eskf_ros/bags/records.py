@@ -1,0 +1,81 @@
+"""What the file formats have in common: a recording is a sequence of blocks of serialised messages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """Type (as in `sensor_msgs/msg/Imu`) and number of messages of a topic."""
+
+    type: str
+    count: int
+
+
+class Payloads(NamedTuple):
+    """Serialised messages of one topic in file order: times (n,) int64 ns, and the payloads in groups of equal length.
+
+    A group is (positions in `times`, or None for all of them in order; bytes (m, length) uint8).
+    """
+
+    log_time: NDArray[np.int64]
+    groups: list[tuple[NDArray[np.intp] | None, NDArray[np.uint8]]]
+
+
+@dataclass
+class Block:
+    """A part of a recording that is read in one go.
+
+    No message in it is older than `start`; `position` orders the blocks as they lie in the file. `load` reads (and
+    decompresses) it and may run in a worker thread; `unpack`, given what `load` returned, finds the messages of each
+    wanted topic.
+    """
+
+    start: int
+    position: int
+    size: int
+    load: Callable[[], object]
+    unpack: Callable[[object], dict[str, Payloads]]
+
+
+class Source(Protocol):
+    """One file of a recording. Times are log times in ns; `warnings` (one line each) grows while blocks are read."""
+
+    name: str
+    topics: dict[str, TopicInfo]
+    start_time: int
+    end_time: int
+    bytes_total: int
+
+    @property
+    def warnings(self) -> list[str]: ...
+
+    def blocks(self, topics: Mapping[str, str]) -> Iterator[Block]:
+        """The blocks that hold messages of `topics` (name -> type) in the order of their start.
+
+        A block is loaded before the next one is asked for.
+        """
+        ...
+
+    def close(self) -> None: ...
+
+
+def group_by_length(payloads: Sequence[bytes]) -> list[tuple[NDArray[np.intp] | None, NDArray[np.uint8]]]:
+    """Byte strings as groups of equal length, see `Payloads`."""
+    lengths = np.fromiter(map(len, payloads), np.intp, len(payloads))
+    distinct = np.unique(lengths)
+    if len(distinct) == 1:
+        rows = np.frombuffer(b"".join(payloads), np.uint8)
+        return [(None, rows.reshape(len(payloads), int(distinct[0])))]
+    groups: list[tuple[NDArray[np.intp] | None, NDArray[np.uint8]]] = []
+    for length in distinct:
+        positions = np.flatnonzero(lengths == length)
+        rows = np.frombuffer(b"".join([payloads[position] for position in positions.tolist()]), np.uint8)
+        groups.append((positions, rows.reshape(len(positions), int(length))))
+    return groups

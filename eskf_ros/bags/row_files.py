@@ -1,0 +1,199 @@
+"""Recordings that give one message at a time: sqlite3 files, and what only the rosbags library reads."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Container, Iterator, Mapping
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from eskf_ros.bags.errors import BagError
+from eskf_ros.bags.records import Block, Payloads, TopicInfo, group_by_length
+
+if TYPE_CHECKING:
+    from rosbags.rosbag2 import Reader
+
+_ROWS_PER_BLOCK = 8192
+_BYTES_PER_BLOCK = 16 << 20
+
+Row = tuple[str, int, bytes]  # topic, log time (ns), serialised message
+
+
+class _RowSource:
+    """Blocks made of rows that come in the order of their log time."""
+
+    name: str
+    topics: dict[str, TopicInfo]
+    start_time: int
+    end_time: int
+    bytes_total: int
+    warnings: list[str]
+
+    def _rows(self, topics: Container[str]) -> Iterator[Row]:
+        raise NotImplementedError
+
+    def blocks(self, topics: Mapping[str, str]) -> Iterator[Block]:
+        """See `Source.blocks`."""
+        wanted = {topic: info.count for topic, info in self.topics.items() if topic in topics and info.count}
+        remaining = sum(wanted.values())
+        bytes_per_row = self.bytes_total / max(remaining, 1)
+        rows = self._survivors(wanted)
+        first = next(rows, None)
+        position = 0
+
+        def load() -> list[Row]:
+            nonlocal first
+            if first is None:
+                return []
+            block, size = [first], len(first[2])
+            first = None
+            for row in rows:
+                if (len(block) >= _ROWS_PER_BLOCK or size >= _BYTES_PER_BLOCK) and row[1] > block[-1][1]:
+                    first = row
+                    break
+                block.append(row)
+                size += len(row[2])
+            return block
+
+        while first is not None:
+            count = min(remaining, _ROWS_PER_BLOCK)
+            remaining -= count
+            position += 1
+            yield Block(first[1], position, int(count * bytes_per_row), load, _unpack)
+
+    def _survivors(self, wanted: Mapping[str, int]) -> Iterator[Row]:
+        """The rows up to the first damage, which becomes a warning."""
+        rows = self._rows(wanted)
+        done = 0
+        while True:
+            try:
+                row = next(rows, None)
+            except Exception as error:  # any of three libraries, on damaged input: what was read is used
+                total = sum(wanted.values())
+                self.warnings.append(
+                    f"{self.name}: damaged after {done} of {total} messages of {', '.join(wanted)} ({error}); "
+                    "the messages before are used"
+                )
+                return
+            if row is None:
+                return
+            done += 1
+            yield row
+
+
+def _unpack(loaded: object) -> dict[str, Payloads]:
+    by_topic: dict[str, tuple[list[int], list[bytes]]] = {}
+    for topic, log_time, data in cast("list[Row]", loaded):
+        times, payloads = by_topic.setdefault(topic, ([], []))
+        times.append(log_time)
+        payloads.append(data)
+    return {
+        topic: Payloads(np.array(times, np.int64), group_by_length(payloads))
+        for topic, (times, payloads) in by_topic.items()
+    }
+
+
+class SqliteFile(_RowSource):
+    """One .db3 file as a `Source`."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the file and count its messages.
+
+        Raises:
+            BagError: it cannot be opened or is no rosbag2 file.
+        """
+        self.name = str(path)
+        self.warnings = []
+        self.bytes_total = path.stat().st_size
+        # With a write-ahead log beside it (a recorder that was killed) the newest messages are in there.
+        access = "mode=ro" if path.with_name(path.name + "-wal").exists() else "mode=ro&immutable=1"
+        try:
+            self._connection = sqlite3.connect(
+                f"{path.absolute().as_uri()}?{access}", uri=True, check_same_thread=False
+            )
+            topics = self._connection.execute("SELECT id, name, type FROM topics").fetchall()
+        except sqlite3.Error as error:
+            raise BagError(f"{path}: cannot be read as a rosbag2 sqlite3 file ({error})") from error
+        self._names: dict[int, str] = {number: name for number, name, _ in topics}
+        self._damaged = False
+        counts: dict[int, tuple[int, int, int]] = {}
+        try:
+            for number, *values in self._connection.execute(
+                "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY topic_id"
+            ):
+                count, first, last = map(int, values)
+                counts[number] = (count, first, last)
+        except (sqlite3.Error, TypeError, ValueError):
+            self._damaged = True
+            counts = self._count_survivors()
+        self.topics = {}
+        for number, name, type_name in topics:
+            known = self.topics[name].count if name in self.topics else 0
+            self.topics[name] = TopicInfo(type_name, known + counts.get(number, (0, 0, 0))[0])
+        self.start_time = min((first for _, first, _ in counts.values()), default=0)
+        self.end_time = max((last for _, _, last in counts.values()), default=0)
+
+    def _count_survivors(self) -> dict[int, tuple[int, int, int]]:
+        counts: dict[int, tuple[int, int, int]] = {}
+        try:
+            for number, time in self._connection.execute("SELECT topic_id, timestamp FROM messages NOT INDEXED"):
+                count, first, last = counts.get(number, (0, time, time))
+                counts[number] = (count + 1, min(first, time), max(last, time))
+        except (sqlite3.Error, TypeError) as error:
+            done = sum(count for count, _, _ in counts.values())
+            self.warnings.append(f"{self.name}: damaged after {done} messages ({error}); the messages before are used")
+        return counts
+
+    def _rows(self, topics: Container[str]) -> Iterator[Row]:
+        numbers = {number: name for number, name in self._names.items() if name in topics}
+        chosen = ",".join(map(str, numbers))
+        # Sorting needs every row; in a damaged file the rows are taken as they lie, which is the order of recording.
+        table, order = ("messages NOT INDEXED", "") if self._damaged else ("messages", " ORDER BY timestamp, id")
+        query = f"SELECT topic_id, timestamp, data FROM {table} WHERE topic_id IN ({chosen}){order}"
+        with closing(self._connection.cursor()) as cursor:
+            try:
+                for number, time, data in cursor.execute(query):
+                    yield numbers[number], int(time), bytes(data)
+            except sqlite3.Error:
+                if not self._damaged:
+                    raise
+
+    def close(self) -> None:
+        """Close the database."""
+        self._connection.close()
+
+
+class RosbagsDirectory(_RowSource):
+    """A rosbag2 directory read by the rosbags library: compression by message or by file."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the directory; compressed files are unpacked to a temporary folder.
+
+        Raises:
+            BagError: rosbags cannot open it.
+        """
+        from rosbags.rosbag2 import Reader
+
+        self.name = str(path)
+        self.warnings = []
+        try:
+            self._reader: Reader = Reader(path)
+            self._reader.open()
+        except Exception as error:  # damaged input surfaces as many types there
+            raise BagError(f"{path}: {error}") from error
+        self.topics = {name: TopicInfo(info.msgtype or "", info.msgcount) for name, info in self._reader.topics.items()}
+        counted = self._reader.message_count > 0
+        self.start_time, self.end_time = (self._reader.start_time, self._reader.end_time - 1) if counted else (0, 0)
+        self.bytes_total = sum(file.stat().st_size for file in path.iterdir() if file.is_file())
+
+    def _rows(self, topics: Container[str]) -> Iterator[Row]:
+        connections = [connection for connection in self._reader.connections if connection.topic in topics]
+        for connection, log_time, data in self._reader.messages(connections):
+            yield connection.topic, log_time, bytes(data)
+
+    def close(self) -> None:
+        """Close the files and remove the temporary ones."""
+        self._reader.close()
