@@ -18,6 +18,12 @@ def cross(a, b):
 
 
 @njit
+def dot(a, b):
+    """Return the scalar product of two 3-vectors."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit
 def multiply(a, b):
     """Return the Hamilton product of two quaternions (Sola, eq. 12)."""
     return (
@@ -67,6 +73,23 @@ def to_matrix(q):
         (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
         (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
     )
+
+
+@njit
+def from_matrix(m):
+    """Return the unit quaternion (w >= 0) of a rotation matrix, by its largest component (Shepperd's method)."""
+    trace = m[0][0] + m[1][1] + m[2][2]
+    if trace >= max(m[0][0], m[1][1], m[2][2]):
+        q = (1.0 + trace, m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1])
+    elif m[0][0] >= m[1][1] and m[0][0] >= m[2][2]:
+        q = (m[2][1] - m[1][2], 1.0 + 2.0 * m[0][0] - trace, m[0][1] + m[1][0], m[0][2] + m[2][0])
+    elif m[1][1] >= m[2][2]:
+        q = (m[0][2] - m[2][0], m[0][1] + m[1][0], 1.0 + 2.0 * m[1][1] - trace, m[1][2] + m[2][1])
+    else:
+        q = (m[1][0] - m[0][1], m[0][2] + m[2][0], m[1][2] + m[2][1], 1.0 + 2.0 * m[2][2] - trace)
+    if q[0] < 0.0:
+        q = (-q[0], -q[1], -q[2], -q[3])
+    return normalized(q)
 
 
 @njit

@@ -1,0 +1,1 @@
+"""The estimator: knows neither ROS, nor files, nor wall clocks."""

@@ -1,0 +1,1 @@
+"""One file per aid: prediction, innovation, Jacobian, noise; nothing else."""

@@ -1,0 +1,50 @@
+"""GNSS position of the antenna.
+
+Payload: latitude, longitude (rad), ellipsoidal altitude (m), covariance in East-North-Up at the fix (m2: ee, en, eu,
+nn, nu, uu). Groves, section 14.3.1, for the local frame and a map-side attitude error.
+"""
+
+from __future__ import annotations
+
+from eskf_ros.compiled import njit
+from eskf_ros.earth import east_north_up_to_ecef, geodetic_to_ecef
+from eskf_ros.filter.aiding.common import clear, set_east_north_up_covariance, set_identity, set_minus_cross
+from eskf_ros.filter.layout import ATTITUDE, POSITION
+from eskf_ros.rotation import rotate, rotate_back, to_matrix
+
+SIZE = 3
+
+
+@njit
+def position_of_fix(state, payload):
+    """Return the map position (m) of a fix."""
+    fix = geodetic_to_ecef(payload[0], payload[1], payload[2])
+    offset = (fix[0] - state.origin_ecef[0], fix[1] - state.origin_ecef[1], fix[2] - state.origin_ecef[2])
+    return rotate_back(state.map_to_ecef, offset)
+
+
+@njit
+def predict(state, settings):
+    """Return the map position (m) of the antenna: position + R lever_arm."""
+    lever = rotate(to_matrix(state.attitude), settings.lever_arm_body)
+    return (state.position_map[0] + lever[0], state.position_map[1] + lever[1], state.position_map[2] + lever[2])
+
+
+@njit
+def linearize(state, payload, settings, work):
+    """Write innovation, Jacobian and noise of one fix to ``work``; return the number of scalars."""
+    clear(work)
+    measured = position_of_fix(state, payload)
+    predicted = predict(state, settings)
+    for i in range(3):
+        work.innovation[i] = measured[i] - predicted[i]
+    set_identity(work.jacobian, POSITION)
+    set_east_north_up_covariance(work.noise, state, east_north_up_to_ecef(payload[0], payload[1]), payload, 3)
+    lever = rotate(to_matrix(state.attitude), settings.lever_arm_body)
+    if state.heading_known == 0:
+        # The lever arm points anywhere around the vertical: its horizontal length is an error of the prediction.
+        for i in range(2):
+            work.noise[i, i] += lever[0] ** 2 + lever[1] ** 2
+    else:
+        set_minus_cross(work.jacobian, ATTITUDE, lever)
+    return SIZE

@@ -1,0 +1,345 @@
+"""Start-up: level from gravity, position from the first fix, heading from a parameter or from course over ground.
+
+While the heading is unknown its error has the variance of a half turn and is not estimated: GNSS moves position and
+velocity only (``strapdown.step`` cuts the coupling), the gyros carry the attitude. Every still window until the
+heading is known levels again.
+"""
+
+from __future__ import annotations
+
+import math
+
+from eskf_ros.compiled import njit
+from eskf_ros.earth import EARTH_RATE, STANDARD_GRAVITY, east_north_up_to_ecef, geodetic_to_ecef
+from eskf_ros.filter.aiding.gnss_position import position_of_fix
+from eskf_ros.filter.layout import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, NEVER, POSITION, VELOCITY
+from eskf_ros.filter.strapdown import gravity_map
+from eskf_ros.rotation import (
+    cross,
+    dot,
+    from_rotation_vector,
+    multiply,
+    normalized,
+    rotate,
+    rotate_back,
+    to_matrix,
+)
+
+START_POSITION_STD = 1000.0
+START_VELOCITY_STD = 100.0
+MOVING_SPEED = 0.5
+"""A speed (m/s) that three sigma above zero proves motion."""
+
+COURSE_MAX_STD = 0.17
+COURSE_MAX_TURN_RATE = 0.2
+"""Course over ground gives heading only when it is this certain (rad) and the robot turns no faster (rad/s)."""
+
+MINIMUM_WINDOW_SAMPLES = 10
+
+
+@njit
+def set_datum(state, latitude, longitude, altitude):
+    """Latch the local frame: East-North-Up at a geodetic position (rad, rad, m)."""
+    state.datum[0] = latitude
+    state.datum[1] = longitude
+    state.datum[2] = altitude
+    origin = geodetic_to_ecef(latitude, longitude, altitude)
+    rotation = east_north_up_to_ecef(latitude, longitude)
+    earth_rate = rotate_back(rotation, (0.0, 0.0, EARTH_RATE))
+    for i in range(3):
+        state.origin_ecef[i] = origin[i]
+        state.earth_rate_map[i] = earth_rate[i]
+        for j in range(3):
+            state.map_to_ecef[i, j] = rotation[i][j]
+    state.datum_known = 1
+
+
+@njit
+def local_up(state):
+    """Return the unit vector against gravity (map axes) at the current position."""
+    gravity = gravity_map(state, (state.position_map[0], state.position_map[1], state.position_map[2]))
+    scale = -1.0 / math.sqrt(dot(gravity, gravity))
+    return (gravity[0] * scale, gravity[1] * scale, gravity[2] * scale)
+
+
+@njit
+def turn_attitude(state, rotation_vector):
+    """Turn the attitude by a rotation vector in map axes."""
+    attitude = (state.attitude[0], state.attitude[1], state.attitude[2], state.attitude[3])
+    attitude = normalized(multiply(from_rotation_vector(rotation_vector), attitude))
+    for i in range(4):
+        state.attitude[i] = attitude[i]
+
+
+@njit
+def shortest_turn(a, b):
+    """Return the shortest rotation vector that turns unit vector ``a`` into ``b``."""
+    axis = cross(a, b)
+    sine = math.sqrt(dot(axis, axis))
+    cosine = dot(a, b)
+    if sine < 1e-9:
+        if cosine > 0.0:
+            return (0.0, 0.0, 0.0)
+        # Opposite: half a turn about any perpendicular axis.
+        if abs(a[0]) < 0.9:
+            axis = cross(a, (1.0, 0.0, 0.0))
+        else:
+            axis = cross(a, (0.0, 1.0, 0.0))
+        sine = math.sqrt(dot(axis, axis))
+    scale = math.atan2(sine, cosine) / sine
+    return (axis[0] * scale, axis[1] * scale, axis[2] * scale)
+
+
+@njit
+def restart(state):
+    """Forget everything but the datum and the biases: the IMU was silent for too long to bridge."""
+    state.level_known = 0
+    state.position_known = 0
+    state.heading_known = 0
+    state.first_stamp = NEVER
+    state.window_start = NEVER
+    state.still_count = 0
+    for i in range(3):
+        state.position_map[i] = 0.0
+        state.velocity_map[i] = 0.0
+
+
+@njit
+def watch_stillness(state, settings):
+    """Add the newest IMU sample to the stillness window; at the end of a window level if that is still wanted."""
+    if state.first_stamp == NEVER:
+        state.first_stamp = state.stamp
+    if state.window_start == NEVER:
+        state.window_start = state.stamp
+        state.window_count = 0
+        for i in range(6):
+            state.window_sum[i] = 0.0
+            state.window_square_sum[i] = 0.0
+    for i in range(3):
+        state.window_sum[i] += state.specific_force[i]
+        state.window_square_sum[i] += state.specific_force[i] ** 2
+        state.window_sum[3 + i] += state.angular_rate[i]
+        state.window_square_sum[3 + i] += state.angular_rate[i] ** 2
+    state.window_count += 1
+    duration = (state.stamp - state.window_start) * 1e-9
+    if duration < settings.static_duration or state.window_count < MINIMUM_WINDOW_SAMPLES:
+        return
+    still = is_still(state, settings) and state.motion_stamp < state.window_start
+    if not still:
+        state.still_count = 0
+        for i in range(6):
+            state.still_sum[i] = 0.0
+    else:
+        state.still_count += state.window_count
+        for i in range(6):
+            state.still_sum[i] += state.window_sum[i]
+    if state.heading_known == 0 or state.position_known == 0:
+        if still:
+            level(state, state.still_sum, state.still_count, duration / state.window_count, True, settings)
+        elif state.level_known == 0 and (state.stamp - state.first_stamp) * 1e-9 >= settings.moving_start_after:
+            level(state, state.window_sum, state.window_count, duration / state.window_count, False, settings)
+    state.window_start = NEVER
+
+
+@njit
+def is_still(state, settings):
+    """Say whether the spread of the readings in the full window is that of a robot at rest."""
+    for i in range(6):
+        mean = state.window_sum[i] / state.window_count
+        variance = state.window_square_sum[i] / state.window_count - mean * mean
+        limit = settings.still_accel_std if i < 3 else settings.still_gyro_std
+        if variance > limit * limit:
+            return False
+    return True
+
+
+@njit
+def level(state, sums, count, interval, still, settings):
+    """Set roll, pitch and, at rest, the gyro bias from mean readings; heading stays as it was.
+
+    ``sums`` of force (m/s2) and rate (rad/s) over ``count`` samples ``interval`` s apart. The accelerometer bias
+    tilts the result, theta = up x (R dba) / g: the cross covariance says so (Groves, section 5.6.2).
+    """
+    force = (sums[0] / count, sums[1] / count, sums[2] / count)
+    strength = math.sqrt(dot(force, force))
+    if strength < 0.5 * STANDARD_GRAVITY:
+        return
+    up = local_up(state)
+    measured = rotate(to_matrix(state.attitude), (force[0] / strength, force[1] / strength, force[2] / strength))
+    turn_attitude(state, shortest_turn(measured, up))
+    rotation = to_matrix(state.attitude)
+
+    covariance = state.covariance
+    for i in range(ATTITUDE, ERROR_SIZE):
+        for j in range(ERROR_SIZE):
+            covariance[i, j] = 0.0
+            covariance[j, i] = 0.0
+    accel_bias_variance = settings.accel_bias_std**2
+    tilt_noise = settings.moving_tilt_std**2
+    if still:
+        tilt_noise = settings.accel_noise_density**2 / (count * interval) / strength**2
+    heading_variance = math.pi**2
+    if state.heading_known == 1:
+        heading_variance = settings.initial_heading_std**2
+    for i in range(3):
+        state.accel_bias[i] = 0.0
+        covariance[ACCEL_BIAS + i, ACCEL_BIAS + i] = accel_bias_variance
+        # Column i of [up]x R / g.
+        tilt = cross(up, (rotation[0][i], rotation[1][i], rotation[2][i]))
+        for j in range(3):
+            covariance[ATTITUDE + j, ACCEL_BIAS + i] = tilt[j] / strength * accel_bias_variance
+            covariance[ACCEL_BIAS + i, ATTITUDE + j] = tilt[j] / strength * accel_bias_variance
+        for j in range(3):
+            horizontal = -up[i] * up[j]
+            if i == j:
+                horizontal += 1.0
+            covariance[ATTITUDE + i, ATTITUDE + j] = (
+                horizontal * (accel_bias_variance / strength**2 + tilt_noise) + up[i] * up[j] * heading_variance
+            )
+    set_gyro_bias(
+        state, (sums[3] / count, sums[4] / count, sums[5] / count), rotation, up, count * interval, still, settings
+    )
+    if state.level_known == 0 and not math.isnan(settings.initial_heading):
+        state.heading_known = 1
+        set_heading(state, settings.initial_heading, settings.initial_heading_std, settings)
+    state.level_known = 1
+
+
+@njit
+def set_gyro_bias(state, mean_rate, rotation, up, duration, still, settings):
+    """Estimate the gyro bias from the mean rate at rest; what is not known of the Earth rate enters its sigma.
+
+    The prior (zero, ``gyro_bias_std``) and the mean are weighed along the vertical and across it, because without
+    heading only the vertical part of the Earth rate is known.
+    """
+    prior = settings.gyro_bias_std**2
+    noise = settings.gyro_noise_density**2 / duration
+    earth = state.earth_rate_map
+    vertical_rate = dot(up, earth)
+    horizontal_square = dot(earth, earth) - vertical_rate**2
+    known = (vertical_rate * up[0], vertical_rate * up[1], vertical_rate * up[2])
+    vertical_variance = noise
+    horizontal_variance = noise + horizontal_square
+    if state.datum_known == 0:
+        vertical_variance = noise + EARTH_RATE**2
+        horizontal_variance = noise + EARTH_RATE**2
+    elif state.heading_known == 1:
+        known = (earth[0], earth[1], earth[2])
+        horizontal_variance = noise + horizontal_square * settings.initial_heading_std**2
+    vertical_gain = prior / (prior + vertical_variance) if still and prior > 0.0 else 0.0
+    horizontal_gain = prior / (prior + horizontal_variance) if still and prior > 0.0 else 0.0
+    mean_map = rotate(rotation, mean_rate)
+    excess = (mean_map[0] - known[0], mean_map[1] - known[1], mean_map[2] - known[2])
+    vertical = dot(up, excess)
+    bias = rotate_back(
+        rotation,
+        (
+            horizontal_gain * (excess[0] - vertical * up[0]) + vertical_gain * vertical * up[0],
+            horizontal_gain * (excess[1] - vertical * up[1]) + vertical_gain * vertical * up[1],
+            horizontal_gain * (excess[2] - vertical * up[2]) + vertical_gain * vertical * up[2],
+        ),
+    )
+    up_body = rotate_back(rotation, up)
+    across = prior * (1.0 - horizontal_gain)
+    along = prior * (1.0 - vertical_gain)
+    for i in range(3):
+        state.gyro_bias[i] = bias[i]
+        for j in range(3):
+            state.covariance[GYRO_BIAS + i, GYRO_BIAS + j] = (along - across) * up_body[i] * up_body[j]
+        state.covariance[GYRO_BIAS + i, GYRO_BIAS + i] += across
+
+
+@njit
+def heading_of(state, settings):
+    """Return the heading (rad, map: 0 = x, counter-clockwise) of the x axis of base_link."""
+    # The x axis of base_link in IMU axes is the first row of imu_to_base.
+    m = settings.imu_to_base
+    forward = rotate(to_matrix(state.attitude), (m[0, 0], m[0, 1], m[0, 2]))
+    return math.atan2(forward[1], forward[0])
+
+
+@njit
+def set_heading(state, heading, std, settings):
+    """Turn the attitude about the local vertical to ``heading`` (rad), independent of everything else by ``std``."""
+    up = local_up(state)
+    lever = rotate(to_matrix(state.attitude), settings.lever_arm_body)
+    change = heading - heading_of(state, settings)
+    turn_attitude(state, (change * up[0], change * up[1], change * up[2]))
+    covariance = state.covariance
+    for _ in range(2):
+        # Project the vertical component out of the attitude rows, then (second round) out of the columns.
+        for j in range(ERROR_SIZE):
+            vertical = 0.0
+            for i in range(3):
+                vertical += up[i] * covariance[ATTITUDE + i, j]
+            for i in range(3):
+                covariance[ATTITUDE + i, j] -= up[i] * vertical
+        for i in range(ERROR_SIZE):
+            for j in range(i):
+                covariance[i, j], covariance[j, i] = covariance[j, i], covariance[i, j]
+    for i in range(3):
+        for j in range(3):
+            covariance[ATTITUDE + i, ATTITUDE + j] += up[i] * up[j] * std**2
+    if state.position_known == 1:
+        # GNSS held the antenna in place: the body is on the other end of the lever arm.
+        turned = rotate(to_matrix(state.attitude), settings.lever_arm_body)
+        for i in range(3):
+            state.position_map[i] += lever[i] - turned[i]
+
+
+@njit
+def start_position(state, payload):
+    """Take position from the first fix, with a wide prior that the update of this same fix makes narrow."""
+    old_up = local_up(state)
+    if state.datum_known == 0:
+        set_datum(state, payload[0], payload[1], payload[2])
+    position = position_of_fix(state, payload)
+    covariance = state.covariance
+    for i in range(3):
+        state.position_map[i] = position[i]
+        state.velocity_map[i] = 0.0
+        for j in range(ERROR_SIZE):
+            covariance[POSITION + i, j] = 0.0
+            covariance[j, POSITION + i] = 0.0
+            covariance[VELOCITY + i, j] = 0.0
+            covariance[j, VELOCITY + i] = 0.0
+    for i in range(3):
+        covariance[POSITION + i, POSITION + i] = START_POSITION_STD**2
+        covariance[VELOCITY + i, VELOCITY + i] = START_VELOCITY_STD**2
+    turn_attitude(state, shortest_turn(old_up, local_up(state)))
+    state.position_known = 1
+
+
+@njit
+def align_to_course(state, settings):
+    """With heading unknown: note proven motion, and take heading from a certain course, the robot driving forward."""
+    v = state.velocity_map
+    speed = math.sqrt(v[0] ** 2 + v[1] ** 2)
+    if speed == 0.0:
+        return
+    along = (v[0] / speed, v[1] / speed)
+    covariance = state.covariance
+    pxx = covariance[VELOCITY, VELOCITY]
+    pxy = covariance[VELOCITY, VELOCITY + 1]
+    pyy = covariance[VELOCITY + 1, VELOCITY + 1]
+    along_variance = along[0] ** 2 * pxx + 2.0 * along[0] * along[1] * pxy + along[1] ** 2 * pyy
+    across_variance = along[1] ** 2 * pxx - 2.0 * along[0] * along[1] * pxy + along[0] ** 2 * pyy
+    if speed - 3.0 * math.sqrt(along_variance) > MOVING_SPEED:
+        state.motion_stamp = state.stamp
+    course_variance = across_variance / speed**2
+    up = local_up(state)
+    rate = (
+        state.angular_rate[0] - state.gyro_bias[0],
+        state.angular_rate[1] - state.gyro_bias[1],
+        state.angular_rate[2] - state.gyro_bias[2],
+    )
+    turn_rate = dot(up, rotate(to_matrix(state.attitude), rate))
+    if (
+        speed < settings.course_min_speed
+        or course_variance > COURSE_MAX_STD**2
+        or speed**2 < 9.0 * along_variance
+        or abs(turn_rate) > COURSE_MAX_TURN_RATE
+    ):
+        return
+    set_heading(state, math.atan2(v[1], v[0]), math.sqrt(course_variance + settings.course_std**2), settings)
+    state.heading_known = 1

@@ -1,0 +1,259 @@
+"""Memory layout of the estimator: the only place that knows what is where.
+
+Everything the compiled kernels touch is a numpy record with named fields, so that ``state.position_map`` is the same
+code compiled and plain, and a checkpoint is one assignment. Units are SI; stamps are integer nanoseconds.
+
+Body axes are the axes of the IMU and the body origin is the IMU: biases, noise and lever arms live there.
+``output.py`` turns the result into base_link.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+from eskf_ros.compiled import COMPILED
+
+# Error state: first index of each block of three.
+POSITION = 0
+VELOCITY = 3
+ATTITUDE = 6
+ACCEL_BIAS = 9
+GYRO_BIAS = 12
+ERROR_SIZE = 15
+
+NEVER = -(2**62)
+"""Stamp before everything."""
+
+
+class Status(IntEnum):
+    """What the estimator has, in the order in which it gets it."""
+
+    WAITING_IMU = 0
+    LEVELLING = 1
+    WAITING_FIX = 2
+    WAITING_HEADING = 3
+    ALIGNING = 4
+    GOOD = 5
+    COASTING = 6
+
+
+class Verdict(IntEnum):
+    """What became of an offered measurement (a closed list; files show the names in lower case)."""
+
+    WAITING = 0
+    FUSED = 1
+    GATE = 2
+    NON_FINITE = 3
+    BAD_COVARIANCE = 4
+    BAD_VALUE = 5
+    BAD_STAMP = 6
+    NO_FIX = 7
+    DUPLICATE = 8
+    BEFORE_ALIGNMENT = 9
+    OUTSIDE_HISTORY = 10
+    DISABLED = 11
+
+
+class Stream(IntEnum):
+    """Streams by rank: of several messages with one stamp the lower rank comes first."""
+
+    IMU = 0
+    GNSS_POSITION = 1
+    GNSS_VELOCITY = 2
+
+
+STREAM_NAMES = tuple(stream.name.lower() for stream in Stream)
+
+STATE = np.dtype(
+    [
+        # Where the estimator stands in the timeline.
+        ("stamp", "i8"),
+        ("imu_next", "i8"),
+        ("aid_next", "i8"),
+        # Nominal state at ``stamp``; attitude is the quaternion (w x y z) from body to map.
+        ("position_map", "f8", (3,)),
+        ("velocity_map", "f8", (3,)),
+        ("attitude", "f8", (4,)),
+        ("accel_bias", "f8", (3,)),
+        ("gyro_bias", "f8", (3,)),
+        # Covariance of the error state; the attitude error is a small rotation on the map side.
+        ("covariance", "f8", (ERROR_SIZE, ERROR_SIZE)),
+        # Raw IMU reading at ``stamp``; stamp of the last IMU sample and the interval (s) it ended.
+        ("specific_force", "f8", (3,)),
+        ("angular_rate", "f8", (3,)),
+        ("imu_stamp", "i8"),
+        ("imu_interval", "f8"),
+        # Local frame, valid once datum_known.
+        ("datum", "f8", (3,)),
+        ("origin_ecef", "f8", (3,)),
+        ("map_to_ecef", "f8", (3, 3)),
+        ("earth_rate_map", "f8", (3,)),
+        ("datum_known", "i8"),
+        # Start-up.
+        ("level_known", "i8"),
+        ("position_known", "i8"),
+        ("heading_known", "i8"),
+        ("first_stamp", "i8"),
+        ("motion_stamp", "i8"),
+        # Stillness: sums over the window being filled, and over the unbroken run of still windows before it.
+        ("window_start", "i8"),
+        ("window_count", "i8"),
+        ("window_sum", "f8", (6,)),
+        ("window_square_sum", "f8", (6,)),
+        ("still_count", "i8"),
+        ("still_sum", "f8", (6,)),
+        # When absolute aids were last accepted.
+        ("absolute_stamp", "i8"),
+        ("absolute_interval", "i8"),
+    ],
+    align=True,
+)
+"""One state of the estimator: all it knows and all it decides with. Copying it is a checkpoint."""
+
+IMU = np.dtype([("stamp", "i8"), ("specific_force", "f8", (3,)), ("angular_rate", "f8", (3,))], align=True)
+
+PAYLOAD_SIZE = 9
+AID = np.dtype(
+    [
+        ("stamp", "i8"),
+        ("arrival", "i8"),
+        ("stream", "i4"),
+        ("door", "i4"),
+        ("verdict", "i4"),
+        ("dof", "i4"),
+        ("nis", "f8"),
+        ("innovation", "f8", (3,)),
+        ("payload", "f8", (PAYLOAD_SIZE,)),
+    ],
+    align=True,
+)
+"""One offered measurement: what was sent, and what became of it."""
+
+RECORD = np.dtype(
+    [
+        ("stamp", "i8"),
+        ("arrival", "i8"),
+        ("stream", "i4"),
+        ("verdict", "i4"),
+        ("dof", "i4"),
+        ("nis", "f8"),
+        ("innovation", "f8", (3,)),
+    ]
+)
+"""The final record of one offered measurement."""
+
+TIMELINE = np.dtype(
+    [
+        ("imu_count", "i8"),
+        ("aid_count", "i8"),
+        ("checkpoint_count", "i8"),
+        ("since_checkpoint", "i8"),
+        ("recorded", "i8"),
+        ("frontier", "i8"),
+        ("published", "i8"),
+        ("rewind_to", "i8"),
+        ("window", "i8"),
+        ("furthest_late", "i8"),
+        ("imu_offered", "i8"),
+        ("imu_duplicate", "i8"),
+        ("imu_late", "i8"),
+        ("imu_bad_value", "i8"),
+        ("imu_bad_stamp", "i8"),
+        ("imu_ahead", "i8"),
+    ],
+    align=True,
+)
+"""Fill levels of the history buffers, the newest IMU stamp, how far back the next advance has to start; counters.
+
+``recorded``: aids at the head of the buffer whose final record was handed out. ``published``: newest stamp for which
+a row was written. ``furthest_late``: largest lateness (ns) refused. ``imu_ahead``: refused samples in a row whose stamps
+were far ahead.
+"""
+
+SETTINGS = np.dtype(
+    [
+        ("gyro_noise_density", "f8"),
+        ("accel_noise_density", "f8"),
+        ("gyro_bias_random_walk", "f8"),
+        ("accel_bias_random_walk", "f8"),
+        ("gyro_bias_std", "f8"),
+        ("accel_bias_std", "f8"),
+        ("imu_gap", "f8"),
+        ("gap_accel_std", "f8"),
+        ("gap_gyro_std", "f8"),
+        ("imu_to_base", "f8", (3, 3)),
+        ("imu_position_base", "f8", (3,)),
+        ("lever_arm_body", "f8", (3,)),
+        ("gate", "f8", (4,)),
+        ("static_duration", "f8"),
+        ("moving_start_after", "f8"),
+        ("still_gyro_std", "f8"),
+        ("still_accel_std", "f8"),
+        ("moving_tilt_std", "f8"),
+        ("initial_heading", "f8"),
+        ("initial_heading_std", "f8"),
+        ("course_min_speed", "f8"),
+        ("course_std", "f8"),
+        ("good_heading_std", "f8"),
+        ("output_interval", "i8"),
+    ],
+    align=True,
+)
+"""Parameters as the kernels use them: radians, body axes, gate thresholds by degrees of freedom."""
+
+WORK = np.dtype(
+    [
+        ("half", "f8", (ERROR_SIZE, ERROR_SIZE)),
+        ("jacobian", "f8", (3, ERROR_SIZE)),
+        ("innovation", "f8", (3,)),
+        ("noise", "f8", (3, 3)),
+        ("projected", "f8", (3, ERROR_SIZE)),
+        ("innovation_covariance", "f8", (3, 3)),
+        ("gain", "f8", (ERROR_SIZE, 3)),
+        ("residual_gain", "f8", (ERROR_SIZE, 3)),
+        ("correction", "f8", (ERROR_SIZE,)),
+    ],
+    align=True,
+)
+"""Scratch memory of the kernels: nothing is allocated per sample."""
+
+ODOMETRY = np.dtype(
+    [
+        ("stamp", "i8"),
+        ("status", "i4"),
+        ("position_known", "?"),
+        ("heading_known", "?"),
+        ("position_map", "f8", (3,)),
+        ("attitude_body_to_map", "f8", (4,)),
+        ("velocity_map", "f8", (3,)),
+        ("velocity_body", "f8", (3,)),
+        ("angular_rate_body", "f8", (3,)),
+        ("pose_covariance", "f8", (6, 6)),
+        ("twist_covariance", "f8", (6, 6)),
+        ("velocity_covariance_map", "f8", (3, 3)),
+        ("accel_bias", "f8", (3,)),
+        ("gyro_bias", "f8", (3,)),
+        ("accel_bias_std", "f8", (3,)),
+        ("gyro_bias_std", "f8", (3,)),
+    ],
+    align=True,
+)
+"""What is published for one IMU sample: pose and twist of base_link (here "body" is base_link), biases in IMU axes."""
+
+
+def allocate(dtype: np.dtype, count: int = 1) -> np.ndarray:
+    """Return ``count`` zeroed records whose items have attributes, in compiled and in plain code."""
+    memory = np.zeros(count, dtype)
+    # Compiled code reads attributes of any record; plain code only of a recarray, which numba is slow to pass.
+    return memory if COMPILED else memory.view(np.recarray)
+
+
+def blank_state() -> np.ndarray:
+    """Return the state before the first IMU sample."""
+    state = allocate(STATE)
+    for field in ("stamp", "imu_stamp", "first_stamp", "motion_stamp", "window_start", "absolute_stamp"):
+        state[field] = NEVER
+    state["attitude"][0, 0] = 1.0
+    return state

@@ -1,0 +1,465 @@
+"""The navigator: push a sensor sample, get the state. ``advance`` is the whole algorithm."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import chi2
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.aiding import gnss_position, gnss_velocity
+from eskf_ros.filter.alignment import (
+    align_to_course,
+    restart,
+    set_datum,
+    start_position,
+    watch_stillness,
+)
+from eskf_ros.filter.layout import (
+    AID,
+    IMU,
+    NEVER,
+    ODOMETRY,
+    RECORD,
+    SETTINGS,
+    STATE,
+    TIMELINE,
+    WORK,
+    Status,
+    Stream,
+    Verdict,
+    allocate,
+    blank_state,
+)
+from eskf_ros.filter.output import write_odometry
+from eskf_ros.filter.strapdown import SECOND, between, propagate
+from eskf_ros.filter.timeline import (
+    LARGEST_JUMP,
+    doubled,
+    forget,
+    insert_aid,
+    insert_imu,
+    is_duplicate,
+    rewind,
+    save_checkpoint,
+    take_final,
+)
+from eskf_ros.filter.update import update
+from eskf_ros.parameters import Parameters
+from eskf_ros.rotation import from_roll_pitch_yaw, to_matrix
+
+FloatArray = npt.NDArray[np.float64]
+StampArray = npt.NDArray[np.int64]
+
+GNSS_POSITION = int(Stream.GNSS_POSITION)
+GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
+OPEN_DOOR = int(Verdict.WAITING)
+FUSED = int(Verdict.FUSED)
+DUPLICATE = int(Verdict.DUPLICATE)
+BEFORE_ALIGNMENT = int(Verdict.BEFORE_ALIGNMENT)
+
+LONGEST_GAP = 5 * SECOND
+"""The IMU was silent for longer (ns): nothing is left of attitude and velocity, start again."""
+
+IMU_BATCH = 1024
+EARLY_AIDS = 4096
+
+
+@njit
+def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, rows):
+    """Run the filter over all that waits, in the total order; return how many rows were written.
+
+    One row for every IMU sample that is new and first on the output grid.
+    """
+    t, settings, work = timeline[0], settings_[0], work_[0]
+    rewind(states, checkpoints, t, blank)
+    state = states[0]
+    row_count = 0
+    while state.imu_next < t.imu_count:
+        sample = imu[state.imu_next]
+
+        while state.aid_next < t.aid_count and aids[state.aid_next].stamp < sample.stamp:
+            predict(state, aids[state.aid_next].stamp, sample, settings, work)
+            fuse(state, aids, state.aid_next, settings, work)
+            state.aid_next += 1
+
+        previous_stamp = state.imu_stamp
+        predict(state, sample.stamp, sample, settings, work)
+        take_sample(state, sample)
+        watch_stillness(state, settings)
+        save_checkpoint(states, checkpoints, t)
+
+        while state.aid_next < t.aid_count and aids[state.aid_next].stamp == sample.stamp:
+            fuse(state, aids, state.aid_next, settings, work)
+            state.aid_next += 1
+
+        if sample.stamp > t.published:
+            t.published = sample.stamp
+            if state.level_known == 1 and is_on_grid(previous_stamp, sample.stamp, settings.output_interval):
+                write_odometry(state, settings, rows[row_count])
+                row_count += 1
+    return row_count
+
+
+@njit
+def predict(state, stamp, sample, settings, work):
+    """Bring the state to ``stamp``, at or before the IMU sample that comes next."""
+    if state.level_known == 0:
+        return
+    if sample.stamp - state.imu_stamp > LONGEST_GAP:
+        restart(state)
+        return
+    force = (sample.specific_force[0], sample.specific_force[1], sample.specific_force[2])
+    rate = (sample.angular_rate[0], sample.angular_rate[1], sample.angular_rate[2])
+    if stamp != sample.stamp:
+        fraction = (stamp - state.stamp) / (sample.stamp - state.stamp)
+        last_force = (state.specific_force[0], state.specific_force[1], state.specific_force[2])
+        last_rate = (state.angular_rate[0], state.angular_rate[1], state.angular_rate[2])
+        force = between(last_force, force, fraction)
+        rate = between(last_rate, rate, fraction)
+    propagate(state, stamp, force, rate, sample.stamp - state.imu_stamp, settings, work)
+
+
+@njit
+def take_sample(state, sample):
+    """Make an IMU sample the newest reading of the state."""
+    if state.imu_stamp != NEVER:
+        state.imu_interval = (sample.stamp - state.imu_stamp) * 1e-9
+    state.imu_stamp = sample.stamp
+    state.stamp = sample.stamp
+    state.imu_next += 1
+    for i in range(3):
+        state.specific_force[i] = sample.specific_force[i]
+        state.angular_rate[i] = sample.angular_rate[i]
+
+
+@njit
+def fuse(state, aids, i, settings, work):
+    """Offer one measurement to the state and leave the verdict in its record."""
+    aid = aids[i]
+    aid.verdict = aid.door
+    aid.nis = np.nan
+    aid.dof = 0
+    for k in range(3):
+        aid.innovation[k] = np.nan
+    if aid.door != OPEN_DOOR:
+        return
+    if is_duplicate(aids, i):
+        aid.verdict = DUPLICATE
+        return
+    if state.level_known == 0 or (state.position_known == 0 and aid.stream != GNSS_POSITION):
+        aid.verdict = BEFORE_ALIGNMENT
+        return
+    if state.position_known == 0:
+        start_position(state, aid.payload)
+    size = linearize(state, aid, settings, work)
+    for k in range(size):
+        aid.innovation[k] = work.innovation[k]
+    aid.dof = size
+    aid.verdict, aid.nis = update(state, size, settings.gate[size], work)
+    if aid.verdict == FUSED:
+        if aid.stream == GNSS_POSITION:
+            note_absolute(state)
+        if state.heading_known == 0:
+            align_to_course(state, settings)
+
+
+@njit
+def linearize(state, aid, settings, work):
+    """Write innovation, Jacobian and noise of one measurement to ``work``; return its size. The list of aids."""
+    if aid.stream == GNSS_POSITION:
+        return gnss_position.linearize(state, aid.payload, settings, work)
+    return gnss_velocity.linearize(state, aid.payload, settings, work)
+
+
+@njit
+def note_absolute(state):
+    """Remember when an absolute aid was accepted and how long the wait for it was."""
+    if state.absolute_stamp != NEVER:
+        state.absolute_interval = state.stamp - state.absolute_stamp
+    state.absolute_stamp = state.stamp
+
+
+@njit
+def is_on_grid(previous_stamp, stamp, interval):
+    """Say whether a multiple of ``interval`` (0: everything) lies in (previous_stamp, stamp]."""
+    return interval == 0 or previous_stamp == NEVER or stamp // interval != previous_stamp // interval
+
+
+class Navigator:
+    """Error-state Kalman filter over a timeline: the same for the node and for the replay.
+
+    Stamps are int64 nanoseconds on the IMU's clock. Pushes only sort a message into the timeline; the next
+    ``push_imu`` or ``update`` does the work. See ``layout`` for the fields of rows (ODOMETRY) and records (RECORD).
+    """
+
+    def __init__(self, parameters: Parameters, output_rate: float = 0.0) -> None:
+        """Prepare a filter; ``output_rate`` (Hz) of the rows ``push_imu`` returns, 0 for every IMU sample."""
+        self.parameters = parameters
+        self._settings = settings_from(parameters, output_rate)
+        self._gnss_offset = round(parameters.gnss.time_offset * SECOND)
+        self._blank = blank_state()
+        if parameters.datum:
+            latitude, longitude, altitude = parameters.datum
+            set_datum(self._blank[0], math.radians(latitude), math.radians(longitude), altitude)
+        self._states = self._blank.copy()
+        self._timeline = allocate(TIMELINE)
+        self._timeline["frontier"] = NEVER
+        self._timeline["published"] = NEVER
+        self._timeline["rewind_to"] = -NEVER
+        self._timeline["window"] = round(parameters.history.window * SECOND)
+        self._imu = allocate(IMU, 4 * IMU_BATCH)
+        self._aids = allocate(AID, 256)
+        self._checkpoints = allocate(STATE, 256)
+        self._work = allocate(WORK)
+        self._rows = allocate(ODOMETRY, len(self._imu))
+        self._offered = allocate(AID)
+        self._refused: list[np.ndarray] = []
+
+    def push_imu(
+        self,
+        stamps: StampArray,
+        specific_force: FloatArray,
+        angular_rate: FloatArray,
+        arrivals: StampArray | None = None,
+    ) -> np.ndarray:
+        """Take IMU samples, shapes (n,), (n, 3) m/s2, (n, 3) rad/s in IMU axes, and run the filter up to the newest.
+
+        Returns the ODOMETRY rows of the newly processed samples on the output grid, as they would have been published.
+        ``arrivals`` is not used: IMU samples leave no records.
+        """
+        stamps = np.ascontiguousarray(stamps, np.int64)
+        specific_force = np.ascontiguousarray(specific_force, np.float64)
+        angular_rate = np.ascontiguousarray(angular_rate, np.float64)
+        parts = []
+        first = 0
+        while first < len(stamps):
+            self._make_room()
+            batch = min(first + IMU_BATCH, len(stamps))
+            first = insert_imu(self._imu, self._timeline, stamps[:batch], specific_force, angular_rate, first)
+            parts.append(self.update())
+        return parts[0] if len(parts) == 1 else np.concatenate([np.zeros(0, ODOMETRY), *parts])
+
+    def update(self) -> np.ndarray:
+        """Apply what was pushed, late messages included; return rows as ``push_imu`` does."""
+        count = advance(
+            self._states,
+            self._imu,
+            self._aids,
+            self._checkpoints,
+            self._timeline,
+            self._blank,
+            self._settings,
+            self._work,
+            self._rows,
+        )
+        return np.array(self._rows[:count], ODOMETRY)
+
+    def push_gnss_position(
+        self,
+        stamp: int,
+        latitude_deg: float,
+        longitude_deg: float,
+        altitude: float,
+        covariance: Sequence[float] | FloatArray,
+        covariance_type: int,
+        status: int,
+        arrival: int = 0,
+    ) -> None:
+        """Take a position of the antenna: degrees, ellipsoidal metres, nine numbers East-North-Up (m2, row-major).
+
+        ``covariance_type`` and ``status`` as in NavSatFix. An unknown or all-zero covariance takes the table
+        ``gnss.status_std_horizontal`` and ``_vertical``.
+        """
+        gnss = self.parameters.gnss
+        values = (latitude_deg, longitude_deg, altitude)
+        six = _upper_triangle(covariance)
+        if status >= 0 and (covariance_type == 0 or not any(six)):
+            horizontal = gnss.status_std_horizontal[min(status, 2)] ** 2
+            vertical = gnss.status_std_vertical[min(status, 2)] ** 2
+            six = (horizontal, 0.0, 0.0, horizontal, 0.0, vertical)
+        six, trusted = _conditioned(six, gnss.covariance_scale, gnss.position_std_floor)
+        if not gnss.use_position:
+            door = Verdict.DISABLED
+        elif status < 0:
+            door = Verdict.NO_FIX
+        elif not all(map(math.isfinite, values)):
+            door = Verdict.NON_FINITE
+        elif abs(latitude_deg) > 90.0 or abs(longitude_deg) > 360.0 or abs(altitude) > 1e5:
+            door = Verdict.BAD_VALUE
+        else:
+            door = trusted
+        payload = (math.radians(latitude_deg), math.radians(longitude_deg), altitude, *six)
+        self._push_aid(Stream.GNSS_POSITION, stamp + self._gnss_offset, arrival, door, payload)
+
+    def push_gnss_velocity(
+        self, stamp: int, velocity_enu: Sequence[float], covariance: Sequence[float] | FloatArray, arrival: int = 0
+    ) -> None:
+        """Take a velocity of the antenna relative to the Earth: East-North-Up m/s, nine numbers m2/s2 (row-major).
+
+        An all-zero or absent covariance (first number negative) becomes ``gnss.unknown_velocity_std``.
+        """
+        gnss = self.parameters.gnss
+        values = tuple(float(value) for value in velocity_enu)
+        six = _upper_triangle(covariance)
+        if not any(six) or six[0] < 0.0:
+            variance = gnss.unknown_velocity_std**2
+            six = (variance, 0.0, 0.0, variance, 0.0, variance)
+        six, trusted = _conditioned(six, gnss.covariance_scale, gnss.velocity_std_floor)
+        if not gnss.use_velocity:
+            door = Verdict.DISABLED
+        elif not all(map(math.isfinite, values)):
+            door = Verdict.NON_FINITE
+        elif max(map(abs, values)) > 600.0:
+            door = Verdict.BAD_VALUE
+        else:
+            door = trusted
+        self._push_aid(Stream.GNSS_VELOCITY, stamp + self._gnss_offset, arrival, door, (*values, *six))
+
+    def take_records(self) -> np.ndarray:
+        """Return the records (RECORD) that became final since the last call: in the total order, the too late last."""
+        return self._take_records(False)
+
+    def finish(self) -> np.ndarray:
+        """End the data: return all remaining records, those that waited in vain for the IMU as ``waiting``."""
+        self.update()
+        return self._take_records(True)
+
+    @property
+    def odometry(self) -> np.ndarray:
+        """One ODOMETRY row of the state at the newest IMU sample (array of length one)."""
+        row = allocate(ODOMETRY)
+        write_odometry(self._states[0], self._settings[0], row[0])
+        return np.array(row, ODOMETRY)
+
+    @property
+    def state(self) -> np.ndarray:
+        """A copy of the whole state (STATE, array of length one)."""
+        return np.array(self._states, STATE)
+
+    @property
+    def status(self) -> Status:
+        """The rung of the start-up ladder at the newest IMU sample."""
+        return Status(int(self.odometry["status"][0]))
+
+    @property
+    def datum(self) -> tuple[float, float, float] | None:
+        """Origin of the map frame: latitude and longitude (deg) and altitude (m), None before the first fix."""
+        state = self._states[0]
+        if not state["datum_known"]:
+            return None
+        latitude, longitude, altitude = (float(value) for value in state["datum"])
+        return math.degrees(latitude), math.degrees(longitude), altitude
+
+    @property
+    def imu_counts(self) -> dict[str, int]:
+        """IMU samples offered, and refused or replaced by reason."""
+        names = ("offered", "duplicate", "late", "bad_value", "bad_stamp")
+        return {name: int(self._timeline[f"imu_{name}"][0]) for name in names}
+
+    @property
+    def window_needed(self) -> float:
+        """The window (s) that would have kept every message so far; 0 when none was too late."""
+        return float(self._timeline["furthest_late"][0]) / SECOND
+
+    def _push_aid(self, stream: Stream, stamp: int, arrival: int, door: Verdict, payload: Sequence[float]) -> None:
+        frontier = int(self._timeline["frontier"][0])
+        early = frontier == NEVER and int(self._timeline["aid_count"][0]) >= EARLY_AIDS
+        if stamp <= 0 or (frontier != NEVER and stamp > frontier + LARGEST_JUMP):
+            self._refuse(stream, stamp, arrival, Verdict.BAD_STAMP)
+            return
+        if early:
+            self._refuse(stream, stamp, arrival, Verdict.BEFORE_ALIGNMENT)
+            return
+        self._make_room()
+        self._offered[0] = (stamp, arrival, stream, door, door, 0, math.nan, (math.nan,) * 3, tuple(payload))
+        if not insert_aid(self._aids, self._timeline, self._offered):
+            self._refuse(stream, stamp, arrival, Verdict.OUTSIDE_HISTORY)
+
+    def _refuse(self, stream: Stream, stamp: int, arrival: int, verdict: Verdict) -> None:
+        """Record a measurement that never enters the timeline."""
+        self._refused.append(np.array([(stamp, arrival, stream, verdict, 0, math.nan, (math.nan,) * 3)], RECORD))
+
+    def _take_records(self, everything: bool) -> np.ndarray:
+        records = allocate(RECORD, max(1, int(self._timeline["aid_count"][0] - self._timeline["recorded"][0])))
+        count = take_final(self._aids, self._timeline, records, everything)
+        refused, self._refused = self._refused, []
+        return np.concatenate([np.array(records[:count], RECORD), *refused])
+
+    def _make_room(self) -> None:
+        """See that one batch of IMU samples with its checkpoints, and one aid, fit into the buffers."""
+        timeline = self._timeline
+        if len(self._imu) - timeline["imu_count"][0] >= IMU_BATCH and len(self._aids) > timeline["aid_count"][0] + 1:
+            if len(self._checkpoints) - timeline["checkpoint_count"][0] > IMU_BATCH // 16 + 2:
+                return
+        self.update()
+        forget(self._states, self._imu, self._aids, self._checkpoints, timeline)
+        while len(self._imu) < 2 * (timeline["imu_count"][0] + IMU_BATCH):
+            self._imu = doubled(self._imu)
+            self._rows = doubled(self._rows)
+        while len(self._aids) < 2 * (timeline["aid_count"][0] + 2):
+            self._aids = doubled(self._aids)
+        while len(self._checkpoints) < 2 * (timeline["checkpoint_count"][0] + IMU_BATCH // 16 + 2):
+            self._checkpoints = doubled(self._checkpoints)
+
+
+def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarray:
+    """Return the parameters as the kernels use them (SETTINGS): radians, lever arms from the IMU in its axes."""
+    settings = allocate(SETTINGS)
+    imu, alignment = parameters.imu, parameters.alignment
+    for name in (
+        "gyro_noise_density",
+        "accel_noise_density",
+        "gyro_bias_random_walk",
+        "accel_bias_random_walk",
+        "gyro_bias_std",
+        "accel_bias_std",
+    ):
+        settings[name] = getattr(imu, name)
+    settings["imu_gap"] = imu.gap
+    settings["gap_accel_std"] = imu.gap_accel_std
+    settings["gap_gyro_std"] = imu.gap_gyro_std
+    roll, pitch, yaw = (math.radians(angle) for angle in imu.mount_rpy_deg)
+    imu_to_base = np.array(to_matrix(from_roll_pitch_yaw(roll, pitch, yaw)))
+    settings["imu_to_base"] = imu_to_base
+    settings["imu_position_base"] = imu.mount_position
+    settings["lever_arm_body"] = imu_to_base.T @ np.subtract(parameters.gnss.lever_arm, imu.mount_position)
+    settings["gate"][0, 1:] = chi2.ppf(parameters.gnss.gate_probability, [1, 2, 3])
+    settings["static_duration"] = alignment.static_duration
+    settings["moving_start_after"] = alignment.moving_start_after
+    settings["still_gyro_std"] = alignment.still_gyro_std
+    settings["still_accel_std"] = alignment.still_accel_std
+    settings["moving_tilt_std"] = math.radians(alignment.moving_tilt_std_deg)
+    settings["initial_heading"] = math.radians(alignment.initial_heading_deg)
+    settings["initial_heading_std"] = math.radians(alignment.initial_heading_std_deg)
+    settings["course_min_speed"] = alignment.course_min_speed
+    settings["course_std"] = math.radians(alignment.course_std_deg)
+    settings["good_heading_std"] = math.radians(alignment.good_heading_std_deg)
+    settings["output_interval"] = round(SECOND / output_rate) if output_rate > 0.0 else 0
+    return settings
+
+
+def _upper_triangle(covariance: Sequence[float] | FloatArray) -> tuple[float, ...]:
+    c = [float(value) for value in covariance]
+    return (c[0], c[1], c[2], c[4], c[5], c[8])
+
+
+def _conditioned(six: tuple[float, ...], scale: float, std_floor: float) -> tuple[tuple[float, ...], Verdict]:
+    """Scale a covariance (six numbers), lift it to the floor, and say whether it is one."""
+    if not all(map(math.isfinite, six)):
+        return six, Verdict.NON_FINITE
+    xx, xy, xz, yy, yz, zz = (scale * value for value in six)
+    # Raising the diagonal to the floor keeps a positive semidefinite matrix one.
+    floor = std_floor**2
+    lifted = (max(xx, floor), xy, xz, max(yy, floor), yz, max(zz, floor))
+    minor = lifted[0] * lifted[3] - xy * xy
+    determinant = (
+        lifted[0] * (lifted[3] * lifted[5] - yz * yz)
+        - xy * (xy * lifted[5] - yz * xz)
+        + xz * (xy * yz - lifted[3] * xz)
+    )
+    sound = min(xx, yy, zz) >= 0.0 and minor > 0.0 and determinant > 0.0
+    return lifted, Verdict.WAITING if sound else Verdict.BAD_COVARIANCE

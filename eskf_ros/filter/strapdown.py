@@ -1,0 +1,171 @@
+"""Strapdown navigation in the Earth-fixed local frame, one IMU interval at a time.
+
+    d/dt position = velocity
+    d/dt velocity = R f + g(position) - 2 Omega x velocity
+    d/dt R        = R [omega]x - [Omega]x R
+
+with Omega the Earth rate and g the normal gravity (both in map axes), f and omega the specific force and inertial
+rate in body axes. IMU samples are instantaneous values, linear in between (two-sample increments; Savage, Strapdown
+Analytics, ch. 7; Groves, sections 5.5 and 5.6).
+"""
+
+from __future__ import annotations
+
+from eskf_ros.compiled import njit
+from eskf_ros.earth import STANDARD_GRAVITY, normal_gravity_ecef
+from eskf_ros.filter.covariance import add_noise, propagate_covariance
+from eskf_ros.rotation import cross, dot, from_rotation_vector, multiply, normalized, rotate, rotate_back, to_matrix
+
+SECOND = 1_000_000_000
+LONGEST_STEP = 20_000_000
+"""A longer IMU interval is integrated in equal steps of at most this many ns."""
+
+WANDER_ACCELERATION = 0.5
+WANDER_TIME = 1.0
+"""Unknown heading: the robot may accelerate by this much (m/s2) more than measured, for about this long (s)."""
+
+
+@njit
+def gravity_map(state, position_map):
+    """Return normal gravity (m/s2, map axes) at a map position (m); straight down while there is no datum."""
+    if state.datum_known == 0:
+        return (0.0, 0.0, -STANDARD_GRAVITY)
+    offset = rotate(state.map_to_ecef, position_map)
+    gravity = normal_gravity_ecef(
+        state.origin_ecef[0] + offset[0], state.origin_ecef[1] + offset[1], state.origin_ecef[2] + offset[2]
+    )
+    return rotate_back(state.map_to_ecef, gravity)
+
+
+@njit
+def increments(force_0, rate_0, force_1, rate_1, dt):
+    """Return the rotation vector (rad) and the velocity increment (m/s) of one interval of ``dt`` s.
+
+    Rate and force are linear in time. The rotation vector carries the coning term. The velocity increment is in the
+    axes half a rotation vector after the start, where the sculling terms of equal index vanish.
+    """
+    coning = cross(rate_0, rate_1)
+    sculling_a = cross(rate_0, force_1)
+    sculling_b = cross(force_0, rate_1)
+    h = 0.5 * dt
+    k = dt * dt / 12.0
+    return (
+        (
+            h * (rate_0[0] + rate_1[0]) + k * coning[0],
+            h * (rate_0[1] + rate_1[1]) + k * coning[1],
+            h * (rate_0[2] + rate_1[2]) + k * coning[2],
+        ),
+        (
+            h * (force_0[0] + force_1[0]) + k * (sculling_a[0] + sculling_b[0]),
+            h * (force_0[1] + force_1[1]) + k * (sculling_a[1] + sculling_b[1]),
+            h * (force_0[2] + force_1[2]) + k * (sculling_a[2] + sculling_b[2]),
+        ),
+    )
+
+
+@njit
+def half_turned(attitude, angle):
+    """Return ``attitude`` followed by half the body rotation vector ``angle``."""
+    return multiply(attitude, from_rotation_vector((0.5 * angle[0], 0.5 * angle[1], 0.5 * angle[2])))
+
+
+@njit
+def turned(attitude, angle, earth_rate, dt):
+    """Return ``attitude`` after the body turned by ``angle`` and the map by ``earth_rate`` times ``dt``."""
+    earth_turn = from_rotation_vector((-earth_rate[0] * dt, -earth_rate[1] * dt, -earth_rate[2] * dt))
+    return normalized(multiply(multiply(earth_turn, attitude), from_rotation_vector(angle)))
+
+
+@njit
+def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
+    """Advance nominal state and covariance by ``dt`` s between two raw IMU readings (m/s2, rad/s; IMU axes).
+
+    ``gap`` (s) is the length of the hole in the IMU data that is being bridged, 0 for none.
+    """
+    ba = state.accel_bias
+    bg = state.gyro_bias
+    angle, velocity_increment = increments(
+        (force_0[0] - ba[0], force_0[1] - ba[1], force_0[2] - ba[2]),
+        (rate_0[0] - bg[0], rate_0[1] - bg[1], rate_0[2] - bg[2]),
+        (force_1[0] - ba[0], force_1[1] - ba[1], force_1[2] - ba[2]),
+        (rate_1[0] - bg[0], rate_1[1] - bg[1], rate_1[2] - bg[2]),
+        dt,
+    )
+    p = state.position_map
+    v = state.velocity_map
+    earth_rate = state.earth_rate_map
+    attitude = (state.attitude[0], state.attitude[1], state.attitude[2], state.attitude[3])
+    middle = to_matrix(normalized(half_turned(attitude, angle)))
+    dv = rotate(middle, velocity_increment)
+    # The velocity increment belongs to mid-interval, when the map has turned by half of its own.
+    turn = cross(earth_rate, dv)
+    gravity = gravity_map(state, (p[0] + 0.5 * dt * v[0], p[1] + 0.5 * dt * v[1], p[2] + 0.5 * dt * v[2]))
+    coriolis = cross(
+        earth_rate,
+        (
+            v[0] + 0.5 * (dv[0] + gravity[0] * dt),
+            v[1] + 0.5 * (dv[1] + gravity[1] * dt),
+            v[2] + 0.5 * (dv[2] + gravity[2] * dt),
+        ),
+    )
+    force = (dv[0] / dt, dv[1] / dt, dv[2] / dt)
+    # Motion hidden by a gap is constant over it: as a density it has the same variance at the end.
+    velocity_noise = settings.accel_noise_density**2 + settings.gap_accel_std**2 * gap
+    attitude_noise = settings.gyro_noise_density**2 + settings.gap_gyro_std**2 * gap
+    coupling = 1.0
+    if state.heading_known == 0:
+        # The direction of the measured acceleration in the map is unknown: position and velocity live on GNSS alone.
+        coupling = 0.0
+        acceleration = (force[0] + gravity[0], force[1] + gravity[1], force[2] + gravity[2])
+        velocity_noise += WANDER_TIME * (WANDER_ACCELERATION**2 + dot(acceleration, acceleration))
+    for i in range(3):
+        new_velocity = v[i] + coupling * (dv[i] - 0.5 * dt * turn[i] + dt * (gravity[i] - 2.0 * coriolis[i]))
+        if state.position_known == 0:
+            new_velocity = 0.0
+        p[i] += 0.5 * dt * (v[i] + new_velocity)
+        v[i] = new_velocity
+    attitude = turned(attitude, angle, earth_rate, dt)
+    for i in range(4):
+        state.attitude[i] = attitude[i]
+    propagate_covariance(state.covariance, middle, force, gravity, earth_rate, dt, coupling, work)
+    add_noise(state.covariance, velocity_noise, attitude_noise, dt, settings)
+
+
+@njit
+def propagate(state, stamp, force_1, rate_1, sample_interval, settings, work):
+    """Advance the state to ``stamp`` (ns), where the IMU reads ``force_1``, ``rate_1`` (raw, IMU axes).
+
+    Between its last reading and this one the IMU is linear. A long interval is cut into steps. ``sample_interval``
+    (ns) is the one between the two IMU samples around: longer than the gap of the settings, it may hide motion and
+    costs extra uncertainty.
+    """
+    interval = stamp - state.stamp
+    steps = (interval + LONGEST_STEP - 1) // LONGEST_STEP
+    f0 = (state.specific_force[0], state.specific_force[1], state.specific_force[2])
+    w0 = (state.angular_rate[0], state.angular_rate[1], state.angular_rate[2])
+    force_a = f0
+    rate_a = w0
+    seconds = interval / SECOND
+    gap = sample_interval / SECOND
+    if gap <= settings.imu_gap:
+        gap = 0.0
+    for k in range(steps):
+        force_b = between(f0, force_1, (k + 1) / steps)
+        rate_b = between(w0, rate_1, (k + 1) / steps)
+        step(state, force_a, rate_a, force_b, rate_b, seconds / steps, gap, settings, work)
+        force_a = force_b
+        rate_a = rate_b
+    for i in range(3):
+        state.specific_force[i] = force_1[i]
+        state.angular_rate[i] = rate_1[i]
+    state.stamp = stamp
+
+
+@njit
+def between(a, b, fraction):
+    """Return the 3-vector at ``fraction`` of the way from ``a`` to ``b``."""
+    return (
+        a[0] + fraction * (b[0] - a[0]),
+        a[1] + fraction * (b[1] - a[1]),
+        a[2] + fraction * (b[2] - a[2]),
+    )

@@ -1,0 +1,243 @@
+"""The timeline: everything the estimator was told in the last seconds, in one total order, and checkpoints to go back to.
+
+The order is (stamp, stream rank, payload bits). IMU samples and aids wait in two sorted buffers. A checkpoint is a
+copy of the whole state right after an IMU sample and before the aids of the same stamp. What arrives behind the state
+only marks how far to go back: the next advance restores the newest checkpoint before it and applies again all that
+follows, so the result is a function of the sorted contents alone.
+
+A message is in time if its stamp is not older than the newest IMU stamp (the frontier) minus the window.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.layout import NEVER, allocate
+
+CHECKPOINT_SPACING = 16
+"""IMU samples from one checkpoint to the next: what a rewind does again in vain, at the most."""
+
+LARGEST_FORCE = 1000.0
+LARGEST_RATE = 100.0
+"""What no strapdown IMU on a robot reads (m/s2, rad/s)."""
+
+LARGEST_JUMP = 10_000_000_000
+"""A stamp this far (ns) ahead of the frontier is not believed ..."""
+
+JUMP_CONFIRMATIONS = 10
+"""... until so many IMU samples in a row say the same."""
+
+
+@njit
+def go_back_to(timeline, stamp):
+    """Make the next advance start from a checkpoint not later than ``stamp``."""
+    timeline.rewind_to = min(timeline.rewind_to, stamp)
+
+
+@njit
+def rewind(states, checkpoints, timeline, blank):
+    """Restore the newest checkpoint not later than what was asked for, and drop the later ones."""
+    if timeline.rewind_to > states[0].stamp:
+        timeline.rewind_to = -NEVER
+        return
+    count = timeline.checkpoint_count
+    while count > 0 and checkpoints[count - 1].stamp > timeline.rewind_to:
+        count -= 1
+    timeline.checkpoint_count = count
+    timeline.since_checkpoint = 0
+    timeline.rewind_to = -NEVER
+    if count > 0:
+        states[0] = checkpoints[count - 1]
+    else:
+        states[0] = blank[0]
+
+
+@njit
+def save_checkpoint(states, checkpoints, timeline):
+    """Keep a copy of the state after every few IMU samples."""
+    if timeline.checkpoint_count > 0:
+        timeline.since_checkpoint += 1
+        if timeline.since_checkpoint < CHECKPOINT_SPACING:
+            return
+    checkpoints[timeline.checkpoint_count] = states[0]
+    timeline.checkpoint_count += 1
+    timeline.since_checkpoint = 0
+
+
+@njit
+def is_bad_value(force, rate):
+    """Say whether an IMU sample is not finite or beyond anything a robot does."""
+    for i in range(3):
+        if not (abs(force[i]) < LARGEST_FORCE and abs(rate[i]) < LARGEST_RATE):
+            return True
+    return False
+
+
+@njit
+def insert_imu(imu, timeline, stamps, specific_force, angular_rate, first):
+    """Sort samples ``first`` and following into the buffer; return how many were taken before it was full.
+
+    Each is checked at the door: finite, possible, stamp neither too old nor absurdly far ahead. Of two with one stamp
+    the one with the smaller bits stays.
+    """
+    t = timeline[0]
+    k = first
+    while k < len(stamps) and t.imu_count < len(imu):
+        stamp = stamps[k]
+        force = specific_force[k]
+        rate = angular_rate[k]
+        k += 1
+        t.imu_offered += 1
+        if is_bad_value(force, rate):
+            t.imu_bad_value += 1
+            continue
+        if stamp <= 0:
+            t.imu_bad_stamp += 1
+            continue
+        if t.frontier != NEVER:
+            if stamp < t.frontier - t.window:
+                t.imu_late += 1
+                t.furthest_late = max(t.furthest_late, t.frontier - stamp)
+                continue
+            if stamp > t.frontier + LARGEST_JUMP:
+                t.imu_ahead += 1
+                if t.imu_ahead < JUMP_CONFIRMATIONS:
+                    t.imu_bad_stamp += 1
+                    continue
+        t.imu_ahead = 0
+        place = t.imu_count
+        while place > 0 and imu[place - 1].stamp > stamp:
+            place -= 1
+        if place > 0 and imu[place - 1].stamp == stamp:
+            t.imu_duplicate += 1
+            if not is_smaller_sample(force, rate, imu[place - 1]):
+                continue
+            place -= 1
+        else:
+            for i in range(t.imu_count, place, -1):
+                imu[i] = imu[i - 1]
+            t.imu_count += 1
+        imu[place].stamp = stamp
+        for i in range(3):
+            imu[place].specific_force[i] = force[i]
+            imu[place].angular_rate[i] = rate[i]
+        if stamp <= t.frontier:
+            go_back_to(t, imu[place - 1].stamp if place > 0 else NEVER)
+        t.frontier = max(t.frontier, stamp)
+    return k
+
+
+@njit
+def is_smaller_sample(force, rate, other):
+    """Say whether a sample comes before another of the same stamp."""
+    for i in range(3):
+        if force[i] != other.specific_force[i]:
+            return force[i] < other.specific_force[i]
+    for i in range(3):
+        if rate[i] != other.angular_rate[i]:
+            return rate[i] < other.angular_rate[i]
+    return False
+
+
+@njit
+def comes_before(a, b):
+    """Say whether aid ``a`` comes before aid ``b``: stamp, stream, whether the door let it in, payload."""
+    if a.stamp != b.stamp:
+        return a.stamp < b.stamp
+    if a.stream != b.stream:
+        return a.stream < b.stream
+    if a.door != b.door:
+        return a.door < b.door
+    for i in range(len(a.payload)):
+        if a.payload[i] != b.payload[i] and not (math.isnan(a.payload[i]) and math.isnan(b.payload[i])):
+            return a.payload[i] < b.payload[i] or math.isnan(b.payload[i])
+    return False
+
+
+@njit
+def insert_aid(aids, timeline, offered):
+    """Sort one offered measurement into the buffer, which has room; return False when it is too late."""
+    t = timeline[0]
+    aid = offered[0]
+    if t.frontier != NEVER and aid.stamp < t.frontier - t.window:
+        t.furthest_late = max(t.furthest_late, t.frontier - aid.stamp)
+        return False
+    place = t.aid_count
+    while place > 0 and comes_before(aid, aids[place - 1]):
+        place -= 1
+    for i in range(t.aid_count, place, -1):
+        aids[i] = aids[i - 1]
+    aids[place] = aid
+    t.aid_count += 1
+    go_back_to(t, aid.stamp)
+    return True
+
+
+@njit
+def is_duplicate(aids, i):
+    """Say whether an earlier message of the same stream has the same stamp."""
+    if i == 0:
+        return False
+    other = aids[i - 1]
+    return other.stamp == aids[i].stamp and other.stream == aids[i].stream and other.door == 0
+
+
+@njit
+def forget(states, imu, aids, checkpoints, timeline):
+    """Drop what no message in time can reach: all before the newest checkpoint older than the window."""
+    t = timeline[0]
+    keep = 0
+    while keep + 1 < t.checkpoint_count and checkpoints[keep + 1].stamp < t.frontier - t.window:
+        keep += 1
+    if t.checkpoint_count == 0 or checkpoints[keep].stamp >= t.frontier - t.window:
+        return
+    # The sample of the checkpoint itself stays: it is the predecessor of what may still be inserted after it.
+    imu_gone = checkpoints[keep].imu_next - 1
+    aid_gone = min(checkpoints[keep].aid_next, t.recorded)
+    for i in range(imu_gone, t.imu_count):
+        imu[i - imu_gone] = imu[i]
+    for i in range(aid_gone, t.aid_count):
+        aids[i - aid_gone] = aids[i]
+    for i in range(keep, t.checkpoint_count):
+        checkpoints[i - keep] = checkpoints[i]
+    t.imu_count -= imu_gone
+    t.aid_count -= aid_gone
+    t.recorded -= aid_gone
+    t.checkpoint_count -= keep
+    for i in range(t.checkpoint_count):
+        checkpoints[i].imu_next -= imu_gone
+        checkpoints[i].aid_next -= aid_gone
+    states[0].imu_next -= imu_gone
+    states[0].aid_next -= aid_gone
+
+
+@njit
+def take_final(aids, timeline, out, everything):
+    """Copy the records that can no longer change to ``out`` (long enough); return how many."""
+    t = timeline[0]
+    count = 0
+    while t.recorded < t.aid_count:
+        aid = aids[t.recorded]
+        if not everything and (t.frontier == NEVER or aid.stamp >= t.frontier - t.window):
+            break
+        out[count].stamp = aid.stamp
+        out[count].arrival = aid.arrival
+        out[count].stream = aid.stream
+        out[count].verdict = aid.verdict
+        out[count].dof = aid.dof
+        out[count].nis = aid.nis
+        for i in range(3):
+            out[count].innovation[i] = aid.innovation[i]
+        count += 1
+        t.recorded += 1
+    return count
+
+
+def doubled(buffer: np.ndarray) -> np.ndarray:
+    """Return a buffer of twice the size that starts with the contents of this one."""
+    bigger = allocate(buffer.dtype, 2 * len(buffer))
+    bigger[: len(buffer)] = buffer
+    return bigger

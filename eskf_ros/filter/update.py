@@ -1,0 +1,161 @@
+"""The one measurement update every aid goes through: gate, gain, Joseph, inject, reset."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.layout import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, VELOCITY, Verdict
+from eskf_ros.rotation import from_rotation_vector, left_jacobian, multiply, normalized
+
+FUSED = int(Verdict.FUSED)
+GATE = int(Verdict.GATE)
+BAD_COVARIANCE = int(Verdict.BAD_COVARIANCE)
+
+
+@njit
+def update(state, size, gate, work):
+    """Fuse ``size`` scalars described by ``work.jacobian``, ``work.innovation``, ``work.noise``.
+
+    Returns the verdict and the normalised innovation squared; the state changes only when the verdict is fused.
+    ``gate`` is the largest normalised innovation squared that is accepted. Joseph form with the full product
+    (I - K H) P (I - K H)' + K R K' (Groves, eq. 3.58), evaluated through its rank-``size`` parts.
+    """
+    covariance = state.covariance
+    project(covariance, size, work)
+    if not invert_positive(work.innovation_covariance, size):
+        return BAD_COVARIANCE, np.nan
+    inverse = work.innovation_covariance
+    nis = 0.0
+    for a in range(size):
+        for b in range(size):
+            nis += work.innovation[a] * inverse[a, b] * work.innovation[b]
+    if not nis <= gate:
+        return GATE, nis
+    for i in range(ERROR_SIZE):
+        correction = 0.0
+        for a in range(size):
+            gain = 0.0
+            for b in range(size):
+                gain += work.projected[b, i] * inverse[b, a]
+            work.gain[i, a] = gain
+            correction += gain * work.innovation[a]
+        work.correction[i] = correction
+    joseph(covariance, size, work)
+    inject(state, work.correction)
+    reset_attitude_error(covariance, work.correction, work)
+    return FUSED, nis
+
+
+@njit
+def project(covariance, size, work):
+    """Write H P to ``work.projected`` and H P H' + R to ``work.innovation_covariance``."""
+    for a in range(size):
+        for j in range(ERROR_SIZE):
+            work.projected[a, j] = 0.0
+        for i in range(ERROR_SIZE):
+            h = work.jacobian[a, i]
+            if h != 0.0:
+                for j in range(ERROR_SIZE):
+                    work.projected[a, j] += h * covariance[i, j]
+    for a in range(size):
+        for b in range(a + 1):
+            total = work.noise[a, b]
+            for j in range(ERROR_SIZE):
+                total += work.projected[a, j] * work.jacobian[b, j]
+            work.innovation_covariance[a, b] = total
+            work.innovation_covariance[b, a] = total
+
+
+@njit
+def invert_positive(matrix, size):
+    """Invert a symmetric positive definite matrix in place (Gauss-Jordan); return False if it is not one."""
+    for k in range(size):
+        pivot = matrix[k, k]
+        if not (pivot > 0.0 and pivot < math.inf):
+            return False
+        matrix[k, k] = 1.0
+        for j in range(size):
+            matrix[k, j] /= pivot
+        for i in range(size):
+            if i != k:
+                factor = matrix[i, k]
+                matrix[i, k] = 0.0
+                for j in range(size):
+                    matrix[i, j] -= factor * matrix[k, j]
+    for i in range(size):
+        for j in range(i):
+            mean = 0.5 * (matrix[i, j] + matrix[j, i])
+            matrix[i, j] = mean
+            matrix[j, i] = mean
+    return True
+
+
+@njit
+def joseph(covariance, size, work):
+    """Replace P by (I - K H) P (I - K H)' + K R K', exactly symmetric."""
+    gain = work.gain
+    for i in range(ERROR_SIZE):
+        for a in range(size):
+            k = gain[i, a]
+            for j in range(ERROR_SIZE):
+                covariance[i, j] -= k * work.projected[a, j]
+    # ``covariance`` is (I - K H) P now. Both terms on the right are (this H' - K R) K'.
+    for i in range(ERROR_SIZE):
+        for a in range(size):
+            total = 0.0
+            for j in range(ERROR_SIZE):
+                total += covariance[i, j] * work.jacobian[a, j]
+            for b in range(size):
+                total -= gain[i, b] * work.noise[b, a]
+            work.residual_gain[i, a] = total
+    for i in range(ERROR_SIZE):
+        for j in range(i + 1):
+            total = covariance[i, j]
+            for a in range(size):
+                total -= work.residual_gain[i, a] * gain[j, a]
+            covariance[i, j] = total
+            covariance[j, i] = total
+
+
+@njit
+def inject(state, correction):
+    """Move the error estimate into the nominal state (closed loop); the error state is zero afterwards."""
+    for i in range(3):
+        state.position_map[i] += correction[POSITION + i]
+        state.velocity_map[i] += correction[VELOCITY + i]
+        state.accel_bias[i] += correction[ACCEL_BIAS + i]
+        state.gyro_bias[i] += correction[GYRO_BIAS + i]
+    turn = from_rotation_vector((correction[ATTITUDE], correction[ATTITUDE + 1], correction[ATTITUDE + 2]))
+    attitude = normalized(multiply(turn, (state.attitude[0], state.attitude[1], state.attitude[2], state.attitude[3])))
+    for i in range(4):
+        state.attitude[i] = attitude[i]
+
+
+@njit
+def reset_attitude_error(covariance, correction, work):
+    """Express the attitude covariance about the injected attitude (Sola, section 6.3.1, with the full Jacobian)."""
+    jacobian = left_jacobian((correction[ATTITUDE], correction[ATTITUDE + 1], correction[ATTITUDE + 2]))
+    block = work.projected
+    for j in range(ERROR_SIZE):
+        for i in range(3):
+            block[i, j] = (
+                jacobian[i][0] * covariance[ATTITUDE, j]
+                + jacobian[i][1] * covariance[ATTITUDE + 1, j]
+                + jacobian[i][2] * covariance[ATTITUDE + 2, j]
+            )
+    for i in range(3):
+        for j in range(ERROR_SIZE):
+            covariance[ATTITUDE + i, j] = block[i, j]
+            covariance[j, ATTITUDE + i] = block[i, j]
+    for i in range(3):
+        for j in range(i + 1):
+            total = (
+                block[i, ATTITUDE] * jacobian[j][0]
+                + block[i, ATTITUDE + 1] * jacobian[j][1]
+                + block[i, ATTITUDE + 2] * jacobian[j][2]
+            )
+            covariance[ATTITUDE + i, ATTITUDE + j] = total
+            covariance[ATTITUDE + j, ATTITUDE + i] = total
