@@ -151,7 +151,7 @@ def _layout(type_name: str, string_sizes: tuple[int, ...], order: str) -> _Layou
             wire_offset, memory_offset = 4 + position, memory_dtype.fields[field.name][1]  # type: ignore[index]
             previous = blocks[-1] if blocks else None
             if (
-                np.dtype(order + field.code).isnative
+                np.dtype(order + "f8").isnative
                 and previous is not None
                 and previous[2] + previous[4] == wire_offset
                 and previous[3] + previous[4] == memory_offset
