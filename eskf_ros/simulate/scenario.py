@@ -5,6 +5,7 @@ What does not depend on the seed is computed once per process and kept, so that 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
@@ -133,12 +134,13 @@ SCENARIOS: dict[str, Scenario] = {
 class Options:
     """How a scenario is recorded.
 
-    Rates in Hz; ``truth_rate`` divides ``imu_rate``. ``lever_arm`` (m): the antenna in base_link. ``imu_position`` (m)
-    and ``imu_rpy_deg``: pose of the IMU in base_link. ``imu_interval_mean``: see `eskf_ros.simulate.imu`. Standard
-    deviations are (horizontal, vertical) in m and m/s. ``latency``: shortest and longest seconds from a GNSS epoch to
-    its arrival. ``outages``: intervals in seconds from time zero without GNSS; None takes the scenario's. ``start`` and
-    ``stop``: the part of the scenario that is recorded, in seconds from time zero; ``stop`` None is its end. Scale
-    factor errors (standard deviation, 1) and quanta (rad/s, m/s2) are off by default.
+    Rates in Hz; truth is given at every n-th IMU stamp, at most at ``truth_rate``. ``lever_arm`` (m): the antenna in
+    base_link. ``imu_position`` (m) and ``imu_rpy_deg``: pose of the IMU in base_link. ``imu_interval_mean``: see
+    `eskf_ros.simulate.imu`. Standard deviations are (horizontal, vertical) in m and m/s. ``latency``: shortest and
+    longest seconds from a GNSS epoch to its arrival. ``outages``: intervals in seconds from time zero without GNSS;
+    None takes the scenario's. ``start`` and ``stop``: the part of the scenario that is recorded, in seconds from time
+    zero; ``stop`` None is its end. Scale factor errors (standard deviation, 1) and quanta (rad/s, m/s2) are off by
+    default.
     """
 
     grade: str = "industrial"
@@ -164,11 +166,9 @@ class Options:
         """Raise ValueError for options that fit no recording."""
         grade_parameters(self.grade)
         for name in ("imu_rate", "gnss_rate", "truth_rate"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"{name} must be positive, not {getattr(self, name)}")
-        ratio = self.imu_rate / self.truth_rate
-        if abs(ratio - round(ratio)) > 1e-9 or ratio < 1.0:
-            raise ValueError(f"truth_rate {self.truth_rate:g} Hz does not divide imu_rate {self.imu_rate:g} Hz")
+            value = getattr(self, name)
+            if not (value > 0.0 and math.isfinite(value)):
+                raise ValueError(f"{name} must be a positive number of Hz, not {value}")
 
 
 @dataclass(frozen=True)
@@ -335,6 +335,11 @@ def _noise_free(name: str, options: Options) -> _NoiseFree:
         raise ValueError(
             f"start {options.start:g} and stop {stop:g} must lie in order within 0 to {path.duration:.1f} s"
         )
+
+    def elapsed(offsets: Stamps) -> Array:
+        # Rounding to whole nanoseconds must not lead beyond the end.
+        return np.minimum(offsets * 1e-9, path.duration)
+
     mount = ImuMount(options.imu_position, options.imu_rpy_deg)
     interval = 1.0 / options.imu_rate
     # The first sample is one interval after the start, so that an interval mean has its whole interval.
@@ -344,7 +349,7 @@ def _noise_free(name: str, options: Options) -> _NoiseFree:
     rate = np.empty((len(offsets), 3))
     for begin in range(0, len(offsets), _BLOCK):
         block = slice(begin, begin + _BLOCK)
-        times = np.minimum(offsets[block] * 1e-9, path.duration)
+        times = elapsed(offsets[block])
         if options.imu_interval_mean:
             force[block], rate[block] = ideal_interval_means(path, frame, times, interval, mount)
         else:
@@ -353,15 +358,15 @@ def _noise_free(name: str, options: Options) -> _NoiseFree:
     first_epoch = int(np.ceil((options.start - GNSS_PHASE) * options.gnss_rate))
     epochs = np.arange(max(first_epoch, 0), int((stop - GNSS_PHASE) * options.gnss_rate) + 1)
     epoch_offsets = _nanoseconds(GNSS_PHASE + epochs / options.gnss_rate)
-    step = round(options.imu_rate / options.truth_rate)
+    step = math.ceil(options.imu_rate / options.truth_rate - 1e-9)
     truth_offsets = offsets[step - 1 :: step]
-    truth = path.motion(np.minimum(truth_offsets * 1e-9, path.duration))
+    truth = path.motion(elapsed(truth_offsets))
     return _NoiseFree(
         imu_stamp=START_STAMP + offsets,
         specific_force=force,
         angular_rate=rate,
         epoch_stamp=START_STAMP + epoch_offsets,
-        epochs=gnss.ideal_epochs(path, frame, epoch_offsets * 1e-9, options.lever_arm),
+        epochs=gnss.ideal_epochs(path, frame, elapsed(epoch_offsets), options.lever_arm),
         truth_stamp=START_STAMP + truth_offsets,
         truth_position_map=truth.position_map,
         truth_velocity_map=truth.velocity_map,
