@@ -28,10 +28,11 @@ setup(
         "numba>=0.58",
         "pyyaml",
         "rosbags",
-        "lz4",
+        "ruamel.yaml",
         "mcap",
-        "rich",
+        "lz4",
         "zstandard",
+        "rich",
         "matplotlib",
     ],
     extras_require={

@@ -438,7 +438,7 @@ class Leaf:
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             return None
         if value != value:  # NaN; math.isnan fails for integers beyond the range of floats
-            # One object for all: two parameter sets that differ in nothing then compare equal.
+            # One object for all: equal `to_mapping` then means equal parameters.
             return math.nan if self.rule.nan_allowed else None
         rule = self.rule
         minimum = rule.minimum[index] if isinstance(rule.minimum, tuple) else rule.minimum
@@ -655,7 +655,12 @@ def _yaml_group(group: type, prefix: str, parameters: Parameters, lines: list[st
         limits = f"Default {_yaml_value(leaf.default)}{unit}; {leaf.allowed()}; {change}."
         for text in (leaf.rule.description, limits):
             lines += textwrap.wrap(text, 116, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ")
-        lines.append(f"{indent}{item.name}: {_yaml_value(_value(parameters, name))}")
+        value = _value(parameters, name)
+        if value == ():
+            # ROS makes an empty list a parameter without a type, which no node can declare: show the form only.
+            lines.append(f"{indent}# {item.name}: {_yaml_value((0.0,) * max(leaf.rule.lengths))}")
+        else:
+            lines.append(f"{indent}{item.name}: {_yaml_value(value)}")
 
 
 def _yaml_value(value: Value) -> str:

@@ -17,10 +17,15 @@ import eskf_ros
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 # Import name -> name in package indices, where they differ.
-DISTRIBUTIONS = {"yaml": "pyyaml"}
+DISTRIBUTIONS = {"yaml": "pyyaml", "ruamel": "ruamel.yaml"}
 # Import name -> rosdep key that brings it, where it is not python3-NAME.
-ROSDEP_KEYS = {"rosbags": "python3-rosbags-pip", "mcap": "mcap-ros2-support", "lz4": "mcap-ros2-support"}
-ROSDEP_KEYS["zstandard"] = "mcap-ros2-support"
+ROSDEP_KEYS = {
+    "lz4": "mcap-ros2-support",
+    "mcap": "mcap-ros2-support",
+    "rosbags": "python3-rosbags-pip",
+    "ruamel": "python3-rosbags-pip",
+    "zstandard": "mcap-ros2-support",
+}
 
 
 class SetupArguments(dict[str, object]):
