@@ -1,0 +1,188 @@
+"""The messages of a recording on their way into the estimator: in which order, and which are withheld."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eskf_ros.bags import Batch
+from eskf_ros.filter.layout import ODOMETRY, Status, Stream
+from eskf_ros.filter.navigator import Navigator
+from eskf_ros.replay.topics import TopicNames
+
+LARGEST_PUSH = 1024
+"""IMU samples given to the estimator at once when no other message lies between them."""
+LOOK_AHEAD = 10_000_000_000
+"""ns of log time within which messages are put into the order of their stamps."""
+
+Offer = tuple[int, Stream, tuple[Any, ...]]
+"""A GNSS message: how many IMU samples of the batch come before it, its stream, the arguments of the push."""
+
+
+class Feed:
+    """Gives batches of messages to the navigator, in the order of log time or of stamps.
+
+    `outages` are (start, length) in s from the first IMU stamp: GNSS messages with a stamp in [start, start + length)
+    are withheld. `ins_only` withholds all GNSS messages from the moment the state is GOOD.
+
+    Attributes:
+        first_stamp: ns, the earliest IMU stamp of the first batch that has IMU samples.
+        imu_count: IMU samples offered.
+        withheld: how many GNSS messages were not offered, by stream.
+    """
+
+    def __init__(
+        self,
+        navigator: Navigator,
+        topics: TopicNames,
+        order: str = "log",
+        outages: tuple[tuple[float, float], ...] = (),
+        ins_only: bool = False,
+    ) -> None:
+        self._navigator = navigator
+        self._topics = topics
+        self._by_stamp = order == "stamp"
+        self._outages = outages
+        self._ins_only = ins_only
+        self._gnss_over = False
+        self.first_stamp: int | None = None
+        self.imu_count = 0
+        self.withheld = {Stream.GNSS_POSITION: 0, Stream.GNSS_VELOCITY: 0}
+
+    def ordered(self, batches: Iterable[dict[str, Batch]]) -> Iterable[dict[str, Batch]]:
+        """The batches as they have to be pushed."""
+        return in_stamp_order(batches) if self._by_stamp else batches
+
+    def push(self, batch: dict[str, Batch]) -> NDArray[Any]:
+        """Offer the messages of a batch; returns the ODOMETRY rows of its IMU samples, (n,)."""
+        rows = [np.zeros(0, ODOMETRY)]
+        imu = batch.get(self._topics.imu)
+        if imu is not None:
+            stamps = np.ascontiguousarray(imu.messages["stamp"])
+            specific_force = np.ascontiguousarray(imu.messages["linear_acceleration"])
+            angular_rate = np.ascontiguousarray(imu.messages["angular_velocity"])
+            self.imu_count += len(stamps)
+            if self.first_stamp is None and (stamps > 0).any():
+                self.first_stamp = int(stamps[stamps > 0].min())
+        done = 0
+
+        def push_imu_until(end: int) -> None:
+            nonlocal done
+            while imu is not None and done < end:
+                part = slice(done, min(end, done + LARGEST_PUSH))
+                rows.append(
+                    self._navigator.push_imu(stamps[part], specific_force[part], angular_rate[part], imu.log_time[part])
+                )
+                done = part.stop
+
+        for place, stream, arguments in self._offers(batch):
+            push_imu_until(place)
+            self._gnss_over = self._gnss_over or (self._ins_only and self._navigator.status >= Status.GOOD)
+            if self._gnss_over or self._in_outage(arguments[0]):
+                self.withheld[stream] += 1
+            elif stream == Stream.GNSS_POSITION:
+                self._navigator.push_gnss_position(*arguments)
+            else:
+                self._navigator.push_gnss_velocity(*arguments)
+        if imu is not None:
+            push_imu_until(len(stamps))
+        return np.concatenate(rows)
+
+    def _in_outage(self, stamp: int) -> bool:
+        if self.first_stamp is None:
+            return False
+        return any(
+            round(start * 1e9) <= stamp - self.first_stamp < round((start + length) * 1e9)
+            for start, length in self._outages
+        )
+
+    def _time(self, batch: Batch) -> NDArray[np.int64]:
+        return batch.messages["stamp"] if self._by_stamp else batch.log_time
+
+    def _offers(self, batch: dict[str, Batch]) -> list[Offer]:
+        """The GNSS messages of a batch in their order."""
+        imu = batch.get(self._topics.imu)
+        imu_time = np.zeros(0, np.int64) if imu is None else self._time(imu)
+        offers: list[tuple[int, Offer]] = []
+        fixes = batch.get(self._topics.gnss_fix)
+        if fixes is not None:
+            names = (
+                "stamp",
+                "latitude",
+                "longitude",
+                "altitude",
+                "position_covariance",
+                "position_covariance_type",
+                "status",
+            )
+            columns = [_listed(fixes.messages[name]) for name in names]
+            times, places = self._time(fixes), np.searchsorted(imu_time, self._time(fixes))
+            arguments = zip(*columns, fixes.log_time.tolist(), strict=True)
+            offers += _with_place(times, places, Stream.GNSS_POSITION, arguments)
+        velocities = batch.get(self._topics.gnss_velocity)
+        if velocities is not None:
+            covariances = velocities.messages["twist_covariance"].reshape(-1, 6, 6)[:, :3, :3].reshape(-1, 9)
+            columns = [_listed(velocities.messages["stamp"]), _listed(velocities.messages["linear_velocity"])]
+            times, places = self._time(velocities), np.searchsorted(imu_time, self._time(velocities))
+            arguments = zip(*columns, _listed(covariances), velocities.log_time.tolist(), strict=True)
+            offers += _with_place(times, places, Stream.GNSS_VELOCITY, arguments)
+        offers.sort(key=lambda item: item[0])
+        return [offer for _, offer in offers]
+
+
+def _listed(column: NDArray[Any]) -> list[Any]:
+    """Numbers as Python numbers, vectors as arrays."""
+    return column.tolist() if column.ndim == 1 else list(np.ascontiguousarray(column))
+
+
+def _with_place(
+    times: NDArray[np.int64], places: NDArray[np.intp], stream: Stream, arguments: Iterable[tuple[Any, ...]]
+) -> list[tuple[int, Offer]]:
+    return [
+        (time, (place, stream, values))
+        for time, place, values in zip(times.tolist(), places.tolist(), arguments, strict=True)
+    ]
+
+
+def in_stamp_order(batches: Iterable[dict[str, Batch]]) -> Iterator[dict[str, Batch]]:
+    """Batches in the order of stamps out of batches in the order of log time, with bounded memory.
+
+    A message waits until the recording has been read for another `LOOK_AHEAD` of log time; one that was recorded even
+    later than that behind newer stamps comes late here too.
+    """
+    held: dict[str, Batch] = {}
+    for batch in batches:
+        for topic, new in batch.items():
+            held[topic] = _joined(held[topic], new) if topic in held else new
+        newest = max(int(part.log_time.max()) for part in held.values())
+        settled = [part.messages["stamp"][part.log_time <= newest - LOOK_AHEAD] for part in held.values()]
+        settled = [stamps for stamps in settled if len(stamps)]
+        if settled:
+            limit = max(int(stamps.max()) for stamps in settled)
+            yield _taken(held, limit)
+    yield _taken(held, np.iinfo(np.int64).max)
+
+
+def _joined(first: Batch, second: Batch) -> Batch:
+    return Batch(
+        np.concatenate([first.log_time, second.log_time]),
+        np.concatenate([first.messages, second.messages]),
+        second.strings,
+    )
+
+
+def _taken(held: dict[str, Batch], limit: int) -> dict[str, Batch]:
+    """Take the messages with stamps up to `limit` out of `held`, in the order of their stamps."""
+    taken: dict[str, Batch] = {}
+    for topic, part in list(held.items()):
+        chosen = part.messages["stamp"] <= limit
+        if chosen.any():
+            order = np.flatnonzero(chosen)[np.argsort(part.messages["stamp"][chosen], kind="stable")]
+            taken[topic] = Batch(part.log_time[order], part.messages[order], part.strings)
+        held[topic] = Batch(part.log_time[~chosen], part.messages[~chosen], part.strings)
+        if chosen.all():
+            del held[topic]
+    return taken

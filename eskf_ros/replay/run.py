@@ -1,0 +1,120 @@
+"""One recording through the estimator: batches of messages in, result files and a summary out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eskf_ros.bags import open_bag
+from eskf_ros.filter.layout import ODOMETRY
+from eskf_ros.filter.navigator import Navigator
+from eskf_ros.parameters import Parameters
+from eskf_ros.replay.feed import Feed
+from eskf_ros.replay.results import ResultFiles
+from eskf_ros.replay.summary import Summary, truth_result
+from eskf_ros.replay.topics import FIX, find_topics, truth_converter
+from eskf_ros.replay.truth import TruthComparison
+
+TRUTH_RATE = 50.0
+"""Hz: rows for the comparison with truth are at least this dense, whatever the rate of the files."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the command line asks for. Outages are (start, length) in s from the first IMU stamp."""
+
+    folder: Path
+    truth: str = ""
+    outages: tuple[tuple[float, float], ...] = ()
+    mode: str = "loose"
+    order: str = "log"
+    output_rate: float = 50.0
+
+
+class StageClock:
+    """Adds up the wall time of each stage; a stage ends where its `lap` is called."""
+
+    def __init__(self, started: float) -> None:
+        self.stages: dict[str, float] = {}
+        self._started = self._last = started
+
+    def lap(self, stage: str) -> None:
+        """Count the time since the last call for `stage`."""
+        now = time.perf_counter()
+        self.stages[stage] = self.stages.get(stage, 0.0) + now - self._last
+        self._last = now
+
+    def total(self) -> float:
+        """Seconds since the start."""
+        return time.perf_counter() - self._started
+
+
+def replay(
+    bag: Path,
+    parameters: Parameters,
+    options: Options,
+    progress: Callable[[float], None] = lambda share: None,
+    started: float | None = None,
+) -> dict[str, Any]:
+    """Replay `bag`, write the result files to `options.folder`, return the content of summary.json.
+
+    `progress` is called with the share of the recording that is done. Times count from `started` (time.perf_counter).
+
+    Raises:
+        BagError: the recording cannot be read, or a result not be written.
+        InputError: the recording lacks what is needed, or does not fit the options.
+        OSError: the results cannot be written.
+    """
+    clock = StageClock(time.perf_counter() if started is None else started)
+    with open_bag([bag]) as reader:
+        topics, hints = find_topics(reader, bag, parameters.topics, options.truth)
+        to_epochs = truth_converter(topics, bag, parameters)
+        thinned = bool(topics.truth) and 0.0 < options.output_rate < TRUTH_RATE
+        navigator = Navigator(parameters, output_rate=0.0 if thinned else options.output_rate)
+        feed = Feed(navigator, topics, options.order, options.outages, options.mode == "ins-only")
+        truth = TruthComparison(parameters.gnss.lever_arm if topics.truth_type == FIX else (0.0, 0.0, 0.0))
+        summary = Summary(feed, options.outages)
+
+        with ResultFiles(options.folder, parameters.frames, options.output_rate if thinned else 0.0) as files:
+
+            def collect(rows: NDArray[Any], records: NDArray[Any]) -> None:
+                known, datum = rows[rows["position_known"]], navigator.datum
+                if len(known) and topics.truth and datum:
+                    truth.add_rows(known, datum)
+                summary.add(known, records)
+                files.write_rows(rows, datum)
+                files.write_records(records)
+                clock.lap("write")
+
+            clock.lap("start")
+            for batch in feed.ordered(reader.batches(topics.wanted())):
+                clock.lap("read")
+                rows = feed.push(batch)
+                clock.lap("filter")
+                if topics.truth in batch:
+                    truth.add_truth(to_epochs(batch[topics.truth]))
+                collect(rows, navigator.take_records())
+                progress(reader.bytes_done / reader.bytes_total)
+            clock.lap("read")
+            collect(np.zeros(0, ODOMETRY), navigator.finish())
+            files.close()
+            clock.lap("write")
+            compared = truth.compared() if topics.truth else None
+            result = {
+                "bag": str(bag),
+                "mode": options.mode,
+                "order": options.order,
+                **summary.result(navigator, clock.total()),
+                **({} if compared is None else truth_result(topics.truth, truth.offered, compared)),
+                "outages": summary.outages(compared),
+                "warnings": [*reader.warnings, *hints, *summary.warnings(navigator, topics, parameters)],
+                "timing": clock.stages | {"total": clock.total()},
+            }
+            files.write_summary(result)
+    return result

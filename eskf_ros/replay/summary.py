@@ -1,0 +1,186 @@
+"""summary.json: what a replay found out, in numbers that are not rounded."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eskf_ros.filter.layout import ODOMETRY, STREAM_NAMES, Status, Stream, Verdict
+from eskf_ros.filter.navigator import Navigator
+from eskf_ros.parameters import Parameters
+from eskf_ros.replay.feed import Feed
+from eskf_ros.replay.topics import TopicNames
+from eskf_ros.replay.truth import rotation_matrices
+from eskf_ros.simulate.map_frame import MapFrame, east_north_up_to_ecef, to_geodetic
+
+CHI_SQUARE_95 = np.array([math.nan, 3.841458820694124, 5.991464547107979, 7.814727903251179])
+"""95 % quantile of chi-square by degrees of freedom: `in_95` is the share of values not above it."""
+OUTAGE_ERRORS = ("horizontal", "vertical", "heading_deg")
+
+
+class Summary:
+    """Collects rows and final records of one replay; what the feed withheld and offered is taken from `feed`.
+
+    `outages` are (start, length) in s from the first IMU stamp.
+    """
+
+    def __init__(self, feed: Feed, outages: tuple[tuple[float, float], ...]) -> None:
+        self._feed = feed
+        self._outages = outages
+        self._distances = [0.0] * len(outages)
+        self._last_row = np.zeros(0, ODOMETRY)
+        self._rows = 0
+        self._verdicts = np.zeros((len(STREAM_NAMES), len(Verdict)), np.int64)
+        self._nis_count = np.zeros(len(STREAM_NAMES), np.int64)
+        self._nis_inside = np.zeros(len(STREAM_NAMES), np.int64)
+        self._nis_sum = np.zeros(len(STREAM_NAMES))
+
+    def add(self, rows: NDArray[Any], records: NDArray[Any]) -> None:
+        """Take ODOMETRY rows (n,) with known positions and increasing stamps, and final RECORD rows (m,)."""
+        self._rows += len(rows)
+        self._last_row = np.concatenate([self._last_row, rows])
+        steps = np.linalg.norm(np.diff(self._last_row["position_map"], axis=0), axis=1)
+        seconds = self._seconds(self._last_row["stamp"][1:])
+        self._last_row = self._last_row[-1:].copy()
+        for number, (start, length) in enumerate(self._outages):
+            self._distances[number] += float(steps[(seconds > start) & (seconds <= start + length)].sum())
+
+        np.add.at(self._verdicts, (records["stream"], records["verdict"]), 1)
+        tested = records[np.isfinite(records["nis"])]
+        np.add.at(self._nis_count, tested["stream"], 1)
+        np.add.at(self._nis_inside, tested["stream"], tested["nis"] <= CHI_SQUARE_95[tested["dof"]])
+        np.add.at(self._nis_sum, tested["stream"], tested["nis"])
+
+    def _seconds(self, stamps: NDArray[np.int64]) -> NDArray[np.float64]:
+        return np.asarray((stamps - (self._feed.first_stamp or 0)) * 1e-9, np.float64)
+
+    def result(self, navigator: Navigator, wall_s: float) -> dict[str, Any]:
+        """The part of the summary that every replay has."""
+        final = navigator.odometry[0]
+        duration = (int(final["stamp"]) - self._feed.first_stamp) * 1e-9 if self._feed.first_stamp is not None else 0.0
+        return {
+            "duration_s": duration,
+            "imu_count": self._feed.imu_count,
+            "imu": navigator.imu_counts,
+            "wall_s": wall_s,
+            "realtime_factor": duration / wall_s,
+            "datum": None if navigator.datum is None else list(navigator.datum),
+            "aids": {STREAM_NAMES[stream]: self._aid(stream) for stream in self._feed.withheld},
+            "final": final_result(final, navigator.datum),
+        }
+
+    def _aid(self, stream: Stream) -> dict[str, Any]:
+        """`rejected` is every verdict but fused, waiting, and outside_history, which is `late`."""
+        verdicts, tested = self._verdicts[stream], int(self._nis_count[stream])
+        fused, late, waiting = (int(verdicts[v]) for v in (Verdict.FUSED, Verdict.OUTSIDE_HISTORY, Verdict.WAITING))
+        offered = int(verdicts.sum())
+        return {
+            "offered": offered,
+            "fused": fused,
+            "rejected": offered - fused - late - waiting,
+            "late": late,
+            "withheld": self._feed.withheld[stream],
+            "nis_mean": float(self._nis_sum[stream] / tested) if tested else None,
+            "nis_in_95": float(self._nis_inside[stream] / tested) if tested else None,
+            "verdicts": {verdict.name.lower(): int(verdicts[verdict]) for verdict in Verdict if verdicts[verdict]},
+        }
+
+    def outages(self, compared: NDArray[Any] | None) -> list[dict[str, Any]]:
+        """For each outage the length of the estimated path and, with truth, the errors at its last compared epoch."""
+        results = []
+        for (start, length), distance in zip(self._outages, self._distances, strict=True):
+            result: dict[str, Any] = {"start": start, "length": length, "distance": distance}
+            if compared is not None:
+                seconds = self._seconds(compared["stamp"])
+                inside = compared[(seconds >= start) & (seconds <= start + length)]
+                last = inside[-1] if len(inside) else None
+                result |= {name: None if last is None else _number(last[name]) for name in OUTAGE_ERRORS}
+                result["compared_stamp"] = None if last is None else int(last["stamp"])
+            results.append(result)
+        return results
+
+    def warnings(self, navigator: Navigator, topics: TopicNames, parameters: Parameters) -> list[str]:
+        """What the user should know, one line each."""
+        lines = []
+        names = {Stream.GNSS_POSITION: topics.gnss_fix, Stream.GNSS_VELOCITY: topics.gnss_velocity}
+        late = {name: int(self._verdicts[stream, Verdict.OUTSIDE_HISTORY]) for stream, name in names.items()}
+        late[topics.imu] = navigator.imu_counts["late"]
+        if any(late.values()):
+            counts = ", ".join(f"{count} of {name}" for name, count in late.items() if count)
+            lines.append(
+                f"messages too late for history.window = {parameters.history.window:g} s: {counts}; "
+                f"a window of {navigator.window_needed:.3f} s would have taken them"
+            )
+        if not self._rows:
+            lines.append(f"no position was found; what became of the fixes of {topics.gnss_fix} stands in aids.csv")
+        return lines
+
+
+def truth_result(topic: str, offered: int, compared: NDArray[Any]) -> dict[str, Any]:
+    """`truth`, `error` and `nees`: COMPARED rows (n,) out of `offered` truth epochs."""
+    nees = {"position": compared["nees_position"], "attitude": compared["nees_attitude"]}
+    return {
+        "truth": {"topic": topic, "epochs": offered, "compared": len(compared)},
+        "error": {name: _error(compared[name]) for name in ("horizontal", "vertical", "speed", "heading_deg")},
+        "nees": {name: _consistency(values) for name, values in nees.items()},
+    }
+
+
+def _error(values: NDArray[np.float64]) -> dict[str, float] | None:
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return None
+    half, most = np.percentile(values, [50.0, 95.0])
+    rms = math.sqrt(float(np.mean(values**2)))
+    return {"rms": rms, "p50": float(half), "p95": float(most), "max": float(values.max())}
+
+
+def _consistency(values: NDArray[np.float64]) -> dict[str, float] | None:
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return None
+    return {"mean": float(values.mean()), "in_95": float(np.mean(values <= CHI_SQUARE_95[3]))}
+
+
+def final_result(row: NDArray[Any], datum: tuple[float, float, float] | None) -> dict[str, Any]:
+    """The last state, an ODOMETRY row; None for what is not known. Roll, pitch, yaw are about the local vertical."""
+    known = bool(row["position_known"]) and datum is not None
+    result: dict[str, Any] = {
+        "stamp": int(row["stamp"]),
+        "status": Status(int(row["status"])).name,
+        "lla": None,
+        "position": None,
+        "velocity": None,
+        "rpy_deg": None,
+        "accel_bias": _numbers(row["accel_bias"]),
+        "gyro_bias": _numbers(row["gyro_bias"]),
+    }
+    if known and datum is not None:
+        map_frame = MapFrame(datum)
+        geodetic = to_geodetic(map_frame.to_ecef(row["position_map"].reshape(1, 3)))
+        rotation = east_north_up_to_ecef(geodetic)[0].T @ map_frame.rotation_map_to_ecef
+        rotation = rotation @ rotation_matrices(row["attitude_body_to_map"].reshape(1, 4))[0]
+        roll_pitch_yaw = (
+            math.atan2(rotation[2, 1], rotation[2, 2]),
+            math.asin(max(-1.0, min(1.0, -rotation[2, 0]))),
+            math.atan2(rotation[1, 0], rotation[0, 0]),
+        )
+        latitude, longitude, altitude = geodetic[0].tolist()
+        result |= {
+            "lla": [math.degrees(latitude), math.degrees(longitude), altitude],
+            "position": _numbers(row["position_map"]),
+            "velocity": _numbers(row["velocity_map"]),
+            "rpy_deg": [math.degrees(angle) for angle in roll_pitch_yaw],
+        }
+    return result
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _numbers(values: NDArray[np.float64]) -> list[float]:
+    return [float(value) for value in values]

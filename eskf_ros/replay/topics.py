@@ -1,0 +1,121 @@
+"""Which topics of a recording are replayed, and what is said when they are not there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eskf_ros.bags import BagReader, Batch
+from eskf_ros.parameters import Parameters, Topics
+from eskf_ros.replay.truth import epochs_from_fix, epochs_from_odometry
+from eskf_ros.simulate.map_frame import MapFrame
+
+IMU = "sensor_msgs/msg/Imu"
+FIX = "sensor_msgs/msg/NavSatFix"
+VELOCITY = "geometry_msgs/msg/TwistWithCovarianceStamped"
+ODOMETRY = "nav_msgs/msg/Odometry"
+
+
+class InputError(Exception):
+    """A recording or an option that cannot be used; the text is one line for the user."""
+
+
+@dataclass(frozen=True)
+class TopicNames:
+    """Names as they are in the recording; empty: not there, or not wanted."""
+
+    imu: str
+    gnss_fix: str
+    gnss_velocity: str = ""
+    truth: str = ""
+    truth_type: str = ""
+
+    def wanted(self) -> dict[str, str]:
+        """What to read: topic -> type."""
+        types = {self.imu: IMU, self.gnss_fix: FIX, self.gnss_velocity: VELOCITY, self.truth: self.truth_type}
+        return {topic: kind for topic, kind in types.items() if topic}
+
+
+def find_topics(reader: BagReader, bag: Path, names: Topics, truth: str) -> tuple[TopicNames, list[str]]:
+    """Find the topics of the parameters `names`, and the `truth` topic unless empty, in the recording.
+
+    The GNSS velocity may be missing as long as its name is the default; a list of hints then says what else could be
+    meant.
+
+    Raises:
+        InputError: another topic is missing, has no messages or the wrong type.
+    """
+    hints = []
+    imu = _require(reader, bag, names.imu, (IMU,), "set topics.imu in --config FILE")
+    gnss_fix = _require(reader, bag, names.gnss_fix, (FIX,), "set topics.gnss_fix in --config FILE")
+    gnss_velocity = ""
+    if _find(reader, names.gnss_velocity) or names.gnss_velocity != Topics().gnss_velocity:
+        remedy = "set topics.gnss_velocity in --config FILE"
+        gnss_velocity = _require(reader, bag, names.gnss_velocity, (VELOCITY,), remedy)
+    elif others := [topic for topic, info in sorted(reader.topics.items()) if info.type == VELOCITY and info.count]:
+        hints.append(
+            f"no GNSS velocity on {names.gnss_velocity}; if {others[0]} is one, set topics.gnss_velocity to it"
+        )
+    if not truth:
+        return TopicNames(imu, gnss_fix, gnss_velocity), hints
+    topic = _require(reader, bag, truth, (ODOMETRY, FIX), "name it with --truth TOPIC")
+    if topic in (imu, gnss_fix, gnss_velocity):
+        raise InputError(f"{bag}: --truth {truth} is an input of the estimator; truth has to be another topic")
+    return TopicNames(imu, gnss_fix, gnss_velocity, topic, reader.topics[topic].type), hints
+
+
+def _find(reader: BagReader, name: str) -> str:
+    """The topic called `name`: as it stands, in the root namespace, or in the only namespace that has one; or empty."""
+    relative = name.removeprefix("~").strip("/")
+    for candidate in (name, f"/{relative}", relative):
+        if candidate in reader.topics:
+            return candidate
+    inside = [] if name.startswith("/") else [topic for topic in reader.topics if topic.endswith(f"/{relative}")]
+    return inside[0] if len(inside) == 1 else ""
+
+
+def _require(reader: BagReader, bag: Path, name: str, types: tuple[str, ...], remedy: str) -> str:
+    topic = _find(reader, name)
+    if topic and reader.topics[topic].type in types and reader.topics[topic].count:
+        return topic
+    if not topic:
+        problem = f"no topic {name} in the recording"
+    elif reader.topics[topic].type not in types:
+        problem = f"topic {topic} is {reader.topics[topic].type}, not {' or '.join(types)}"
+    else:
+        problem = f"topic {topic} has no messages"
+    there = ", ".join(f"{topic} ({info.type}, {info.count})" for topic, info in sorted(reader.topics.items()))
+    fitting = [topic for topic, info in sorted(reader.topics.items()) if info.type in types and info.count]
+    advice = f"{remedy}: {' or '.join(fitting)}" if fitting else f"nothing in it is {' or '.join(types)}"
+    raise InputError(f"{bag}: {problem}; {advice}. It holds: {there}")
+
+
+def truth_converter(topics: TopicNames, bag: Path, parameters: Parameters) -> Callable[[Batch], NDArray[Any]]:
+    """What makes truth epochs of a batch of the truth topic.
+
+    The result raises InputError for Odometry whose frame is neither `earth` nor the map frame of a configured datum.
+    """
+
+    def from_odometry(batch: Batch) -> NDArray[Any]:
+        frames = {batch.strings[index] for index in np.unique(batch.messages["frame_id"]).tolist()}
+        if frames == {"earth"}:
+            return epochs_from_odometry(batch.messages, None)
+        if frames == {parameters.frames.map}:
+            if parameters.datum:
+                latitude, longitude, altitude = parameters.datum
+                return epochs_from_odometry(batch.messages, MapFrame((latitude, longitude, altitude)))
+            raise InputError(
+                f"{bag}: truth {topics.truth} is given in frame {parameters.frames.map}: "
+                "set datum in --config FILE to the origin it was made with"
+            )
+        raise InputError(
+            f"{bag}: truth {topics.truth} is given in frame {', '.join(map(repr, sorted(frames)))}; "
+            f"'earth' (ECEF) or '{parameters.frames.map}' (with the parameter datum) can be compared"
+        )
+
+    return from_odometry if topics.truth_type == ODOMETRY else lambda batch: epochs_from_fix(batch.messages)
