@@ -485,8 +485,8 @@ def test_bundled_recording_is_what_the_command_makes(tmp_path: Path) -> None:
         for name in made[topic][1].dtype.names or ():
             if name in ("frame_id", "child_frame_id"):
                 continue
-            # Sine and cosine differ in the last digit between processors; nothing else may.
-            np.testing.assert_allclose(made[topic][1][name], bundled[topic][1][name], rtol=1e-13, atol=1e-11)
+            # Sine and cosine may differ in the last digit between processors: 1e-9 m of 6400 km, and nothing else.
+            np.testing.assert_allclose(made[topic][1][name], bundled[topic][1][name], rtol=1e-13, atol=4e-9)
     again = tmp_path / "again" / path.name
     again.parent.mkdir()
     assert command.main(["tunnel_drive", "--truth-rate", "20", "--quiet", "--out", str(again)]) == 0
