@@ -4,7 +4,7 @@ The kernels are plain Python that numba compiles. Without numba, or with ``NUMBA
 runs uncompiled and keeps up with an IMU of about 100 Hz.
 
 numba notices a changed source file only for the function it compiles, not for what that function calls in other
-files. The cache folder therefore carries a digest of all sources of the package: a new version never runs old code.
+files. The cache folder therefore carries a digest of all files with kernels: a new version never runs old code.
 """
 
 from __future__ import annotations
@@ -34,8 +34,10 @@ def _sources_digest() -> str:
     package = Path(__file__).parent
     digest = hashlib.sha256()
     for source in sorted(package.rglob("*.py")):
-        digest.update(source.relative_to(package).as_posix().encode())
-        digest.update(source.read_bytes())
+        text = source.read_bytes()
+        if b"@njit" in text:
+            digest.update(source.relative_to(package).as_posix().encode())
+            digest.update(text)
     return digest.hexdigest()[:16]
 
 

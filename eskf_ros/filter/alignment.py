@@ -12,6 +12,7 @@ import math
 from eskf_ros.compiled import njit
 from eskf_ros.earth import EARTH_RATE, STANDARD_GRAVITY, east_north_up_to_ecef, geodetic_to_ecef
 from eskf_ros.filter.aiding.gnss_position import position_of_fix
+from eskf_ros.filter.covariance import transform_attitude_error
 from eskf_ros.filter.layout import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, NEVER, POSITION, VELOCITY
 from eskf_ros.filter.strapdown import gravity_map
 from eskf_ros.rotation import (
@@ -64,11 +65,13 @@ def local_up(state):
 
 @njit
 def turn_attitude(state, rotation_vector):
-    """Turn the attitude by a rotation vector in map axes."""
+    """Turn the attitude by a rotation vector in map axes, and its error with it (the error is in map axes too)."""
+    turn = from_rotation_vector(rotation_vector)
     attitude = (state.attitude[0], state.attitude[1], state.attitude[2], state.attitude[3])
-    attitude = normalized(multiply(from_rotation_vector(rotation_vector), attitude))
+    attitude = normalized(multiply(turn, attitude))
     for i in range(4):
         state.attitude[i] = attitude[i]
+    transform_attitude_error(state.covariance, to_matrix(turn))
 
 
 @njit
@@ -266,17 +269,12 @@ def set_heading(state, heading, std, settings):
     change = heading - heading_of(state, settings)
     turn_attitude(state, (change * up[0], change * up[1], change * up[2]))
     covariance = state.covariance
-    for _ in range(2):
-        # Project the vertical component out of the attitude rows, then (second round) out of the columns.
-        for j in range(ERROR_SIZE):
-            vertical = 0.0
-            for i in range(3):
-                vertical += up[i] * covariance[ATTITUDE + i, j]
-            for i in range(3):
-                covariance[ATTITUDE + i, j] -= up[i] * vertical
-        for i in range(ERROR_SIZE):
-            for j in range(i):
-                covariance[i, j], covariance[j, i] = covariance[j, i], covariance[i, j]
+    across = (
+        (1.0 - up[0] * up[0], -up[0] * up[1], -up[0] * up[2]),
+        (-up[1] * up[0], 1.0 - up[1] * up[1], -up[1] * up[2]),
+        (-up[2] * up[0], -up[2] * up[1], 1.0 - up[2] * up[2]),
+    )
+    transform_attitude_error(covariance, across)
     for i in range(3):
         for j in range(3):
             covariance[ATTITUDE + i, ATTITUDE + j] += up[i] * up[j] * std**2

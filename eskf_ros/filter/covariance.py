@@ -19,7 +19,8 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import SEMI_MAJOR_AXIS
-from eskf_ros.filter.layout import ERROR_SIZE
+from eskf_ros.filter.layout import ATTITUDE, ERROR_SIZE
+from eskf_ros.rotation import rotate
 
 
 @njit
@@ -121,3 +122,16 @@ def propagate_covariance(covariance, rotation, force, gravity, earth_rate, dt, c
     for i in range(ERROR_SIZE):
         for j in range(i):
             covariance[i, j] = covariance[j, i]
+
+
+@njit
+def transform_attitude_error(covariance, matrix):
+    """Replace the attitude error theta by ``matrix`` theta (3x3 row tuples) in the covariance."""
+    for j in range(ERROR_SIZE):
+        theta = rotate(matrix, (covariance[ATTITUDE, j], covariance[ATTITUDE + 1, j], covariance[ATTITUDE + 2, j]))
+        for i in range(3):
+            covariance[ATTITUDE + i, j] = theta[i]
+    for j in range(ERROR_SIZE):
+        theta = rotate(matrix, (covariance[j, ATTITUDE], covariance[j, ATTITUDE + 1], covariance[j, ATTITUDE + 2]))
+        for i in range(3):
+            covariance[j, ATTITUDE + i] = theta[i]

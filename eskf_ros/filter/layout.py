@@ -168,8 +168,8 @@ TIMELINE = np.dtype(
 """Fill levels of the history buffers, the newest IMU stamp, how far back the next advance has to start; counters.
 
 ``recorded``: aids at the head of the buffer whose final record was handed out. ``published``: newest stamp for which
-a row was written. ``furthest_late``: largest lateness (ns) refused. ``imu_ahead``: refused samples in a row whose stamps
-were far ahead.
+a row was written. ``furthest_late``: largest lateness (ns) refused. ``imu_ahead``: refused samples in a row whose
+stamps were far ahead.
 """
 
 SETTINGS = np.dtype(

@@ -37,6 +37,7 @@ from eskf_ros.filter.layout import (
 from eskf_ros.filter.output import write_odometry
 from eskf_ros.filter.strapdown import SECOND, between, propagate
 from eskf_ros.filter.timeline import (
+    CHECKPOINT_SPACING,
     LARGEST_JUMP,
     doubled,
     forget,
@@ -365,6 +366,11 @@ class Navigator:
         """The window (s) that would have kept every message so far; 0 when none was too late."""
         return float(self._timeline["furthest_late"][0]) / SECOND
 
+    @property
+    def held_bytes(self) -> int:
+        """Memory of the history buffers: grows with window and rates, not with time."""
+        return sum(buffer.nbytes for buffer in (self._imu, self._aids, self._checkpoints, self._rows))
+
     def _push_aid(self, stream: Stream, stamp: int, arrival: int, door: Verdict, payload: Sequence[float]) -> None:
         frontier = int(self._timeline["frontier"][0])
         early = frontier == NEVER and int(self._timeline["aid_count"][0]) >= EARLY_AIDS
@@ -392,9 +398,13 @@ class Navigator:
     def _make_room(self) -> None:
         """See that one batch of IMU samples with its checkpoints, and one aid, fit into the buffers."""
         timeline = self._timeline
-        if len(self._imu) - timeline["imu_count"][0] >= IMU_BATCH and len(self._aids) > timeline["aid_count"][0] + 1:
-            if len(self._checkpoints) - timeline["checkpoint_count"][0] > IMU_BATCH // 16 + 2:
-                return
+        checkpoints_needed = IMU_BATCH // CHECKPOINT_SPACING + 2
+        if (
+            len(self._imu) >= timeline["imu_count"][0] + IMU_BATCH
+            and len(self._aids) > timeline["aid_count"][0] + 1
+            and len(self._checkpoints) >= timeline["checkpoint_count"][0] + checkpoints_needed
+        ):
+            return
         self.update()
         forget(self._states, self._imu, self._aids, self._checkpoints, timeline)
         while len(self._imu) < 2 * (timeline["imu_count"][0] + IMU_BATCH):
@@ -402,7 +412,7 @@ class Navigator:
             self._rows = doubled(self._rows)
         while len(self._aids) < 2 * (timeline["aid_count"][0] + 2):
             self._aids = doubled(self._aids)
-        while len(self._checkpoints) < 2 * (timeline["checkpoint_count"][0] + IMU_BATCH // 16 + 2):
+        while len(self._checkpoints) < 2 * (timeline["checkpoint_count"][0] + checkpoints_needed):
             self._checkpoints = doubled(self._checkpoints)
 
 

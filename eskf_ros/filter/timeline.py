@@ -1,4 +1,4 @@
-"""The timeline: everything the estimator was told in the last seconds, in one total order, and checkpoints to go back to.
+"""The timeline: what the estimator was told in the last seconds, in one total order, and checkpoints to go back to.
 
 The order is (stamp, stream rank, payload bits). IMU samples and aids wait in two sorted buffers. A checkpoint is a
 copy of the whole state right after an IMU sample and before the aids of the same stamp. What arrives behind the state

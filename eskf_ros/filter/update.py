@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.covariance import transform_attitude_error
 from eskf_ros.filter.layout import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, VELOCITY, Verdict
 from eskf_ros.rotation import from_rotation_vector, left_jacobian, multiply, normalized
 
@@ -45,7 +46,9 @@ def update(state, size, gate, work):
         work.correction[i] = correction
     joseph(covariance, size, work)
     inject(state, work.correction)
-    reset_attitude_error(covariance, work.correction, work)
+    # The error is now about the injected attitude (Sola, section 6.3.1, with the full Jacobian).
+    turn = (work.correction[ATTITUDE], work.correction[ATTITUDE + 1], work.correction[ATTITUDE + 2])
+    transform_attitude_error(covariance, left_jacobian(turn))
     return FUSED, nis
 
 
@@ -132,30 +135,3 @@ def inject(state, correction):
     attitude = normalized(multiply(turn, (state.attitude[0], state.attitude[1], state.attitude[2], state.attitude[3])))
     for i in range(4):
         state.attitude[i] = attitude[i]
-
-
-@njit
-def reset_attitude_error(covariance, correction, work):
-    """Express the attitude covariance about the injected attitude (Sola, section 6.3.1, with the full Jacobian)."""
-    jacobian = left_jacobian((correction[ATTITUDE], correction[ATTITUDE + 1], correction[ATTITUDE + 2]))
-    block = work.projected
-    for j in range(ERROR_SIZE):
-        for i in range(3):
-            block[i, j] = (
-                jacobian[i][0] * covariance[ATTITUDE, j]
-                + jacobian[i][1] * covariance[ATTITUDE + 1, j]
-                + jacobian[i][2] * covariance[ATTITUDE + 2, j]
-            )
-    for i in range(3):
-        for j in range(ERROR_SIZE):
-            covariance[ATTITUDE + i, j] = block[i, j]
-            covariance[j, ATTITUDE + i] = block[i, j]
-    for i in range(3):
-        for j in range(i + 1):
-            total = (
-                block[i, ATTITUDE] * jacobian[j][0]
-                + block[i, ATTITUDE + 1] * jacobian[j][1]
-                + block[i, ATTITUDE + 2] * jacobian[j][2]
-            )
-            covariance[ATTITUDE + i, ATTITUDE + j] = total
-            covariance[ATTITUDE + j, ATTITUDE + i] = total

@@ -1,0 +1,234 @@
+"""The timeline: any order of arrival within the window gives the same bits as sorted arrival."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from eskf_ros.filter.layout import Verdict
+from eskf_ros.filter.navigator import Navigator
+from eskf_ros.parameters import from_mapping
+from eskf_ros.simulate.scenario import Recording, simulate
+
+SECOND = 1_000_000_000
+WINDOW = 2.0
+IMU, POSITION, VELOCITY = range(3)
+
+
+@dataclass(frozen=True)
+class Message:
+    """One message: stream, row in the recording, change of its payload (a conflicting double), arrival (ns)."""
+
+    stream: int
+    row: int
+    change: float
+    arrival: int
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    """The pull-away of the drive: levelling, datum, course alignment and turns all lie inside."""
+    return simulate("drive", seed=3, imu_rate=50.0, gnss_rate=4.0, start=12.0, stop=40.0)
+
+
+def navigator_for(recording: Recording, **extra: object) -> Navigator:
+    mapping = {**recording.parameters(), "datum": [], "history.window": WINDOW, **extra}
+    return Navigator(from_mapping(mapping))
+
+
+def stamps_of(recording: Recording, stream: int) -> np.ndarray:
+    return (recording.imu_stamp, recording.fix_stamp, recording.velocity_stamp)[stream]
+
+
+def push(navigator: Navigator, recording: Recording, message: Message) -> None:
+    row, change = message.row, message.change
+    if message.stream == IMU:
+        navigator.push_imu(
+            recording.imu_stamp[row : row + 1],
+            recording.specific_force[row : row + 1] + change,
+            recording.angular_rate[row : row + 1],
+        )
+    elif message.stream == POSITION:
+        navigator.push_gnss_position(
+            int(recording.fix_stamp[row]),
+            float(recording.fix_latitude_deg[row]),
+            float(recording.fix_longitude_deg[row]),
+            float(recording.fix_altitude[row]) + change,
+            recording.fix_covariance[row],
+            2,
+            0,
+            message.arrival,
+        )
+    else:
+        velocity = recording.velocity_enu[row] + change
+        navigator.push_gnss_velocity(
+            int(recording.velocity_stamp[row]), velocity, recording.velocity_covariance[row], message.arrival
+        )
+
+
+def result(recording: Recording, messages: list[Message]) -> tuple[dict[str, bytes], bytes, np.ndarray]:
+    """Give the messages in the order of the list; return the final state, the records without arrival, the records."""
+    navigator = navigator_for(recording)
+    records = []
+    for count, message in enumerate(messages):
+        push(navigator, recording, message)
+        if count % 100 == 0:
+            records.append(navigator.take_records())
+    records.append(navigator.finish())
+    state = navigator.state[0]
+    # Places in the buffers depend on when old contents were dropped; everything else is the estimate.
+    fields = {name: state[name].tobytes() for name in state.dtype.names if name not in ("imu_next", "aid_next")}
+    together = np.concatenate(records)
+    without_arrival = together.copy()
+    without_arrival["arrival"] = 0
+    return fields, without_arrival.tobytes(), together
+
+
+def every_message(recording: Recording, random: np.random.Generator, doubled: float) -> list[Message]:
+    """All messages, some of them twice: the same again, or with another payload."""
+    messages = []
+    for stream in (IMU, POSITION, VELOCITY):
+        for row in range(len(stamps_of(recording, stream))):
+            messages.append(Message(stream, row, 0.0, 0))
+            if random.random() < doubled:
+                messages.append(Message(stream, row, float(random.choice([0.0, -0.5, 0.5])), 0))
+    return messages
+
+
+def arriving(
+    recording: Recording, messages: list[Message], random: np.random.Generator, delays: tuple[float, float, float]
+) -> list[Message]:
+    """The messages in an order in which none is later than the window: each delayed by up to its stream's delay."""
+    timed = []
+    for message in messages:
+        delay = int(random.uniform(0.0, delays[message.stream]) * SECOND)
+        stamp = int(stamps_of(recording, message.stream)[message.row])
+        timed.append(Message(message.stream, message.row, message.change, stamp + delay))
+    return sorted(timed, key=lambda message: message.arrival)
+
+
+@settings(max_examples=25)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    doubled=st.sampled_from([0.0, 0.1, 1.0]),
+    imu_delay=st.sampled_from([0.0, 0.05, 0.5, WINDOW]),
+    position_delay=st.floats(0.0, WINDOW),
+    velocity_delay=st.floats(0.0, WINDOW),
+)
+def test_arrival_order_changes_no_bit(recording, seed, doubled, imu_delay, position_delay, velocity_delay):
+    random = np.random.default_rng(seed)
+    messages = every_message(recording, random, doubled)
+    in_order = arriving(recording, messages, random, (0.0, 0.0, 0.0))
+    shuffled = arriving(recording, messages, random, (imu_delay, position_delay, velocity_delay))
+    state, records, _ = result(recording, in_order)
+    other_state, other_records, _ = result(recording, shuffled)
+    assert other_records == records
+    assert other_state == state
+
+
+def test_sorted_arrival_does_fuse(recording):
+    """The equality above would also hold for a filter that refuses everything."""
+    messages = every_message(recording, np.random.default_rng(0), 0.0)
+    _, _, records = result(recording, arriving(recording, messages, np.random.default_rng(0), (0.0, 0.0, 0.0)))
+    fused = np.mean(records["verdict"] == Verdict.FUSED)
+    assert fused > 0.9
+
+
+def test_late_data_matters(recording):
+    """A filter that ignored late messages would differ: the same delays beyond the window do change the result."""
+    random = np.random.default_rng(5)
+    messages = every_message(recording, random, 0.0)
+    state, _, _ = result(recording, arriving(recording, messages, random, (0.0, 0.0, 0.0)))
+    late_state, _, records = result(recording, arriving(recording, messages, random, (0.0, 2 * WINDOW, 2 * WINDOW)))
+    assert late_state != state
+    assert np.any(records["verdict"] == Verdict.OUTSIDE_HISTORY)
+
+
+def test_too_late_is_counted_and_never_applied(recording):
+    messages = arriving(
+        recording, every_message(recording, np.random.default_rng(0), 0.0), np.random.default_rng(0), (0.0, 0.1, 0.1)
+    )
+    kept, late = messages[:-1], next(m for m in messages if m.stream == POSITION)
+    kept.remove(late)
+    navigator = navigator_for(recording)
+    for message in kept:
+        push(navigator, recording, message)
+    before = navigator.state
+    push(navigator, recording, late)
+    push(navigator, recording, Message(IMU, 0, 0.0, 0))
+    navigator.update()
+    assert navigator.state.tobytes() == before.tobytes()
+    records = navigator.finish()
+    assert np.count_nonzero(records["verdict"] == Verdict.OUTSIDE_HISTORY) == 1
+    assert navigator.imu_counts["late"] == 1
+    lateness = (recording.imu_stamp[-1] - recording.imu_stamp[0]) / SECOND
+    assert navigator.window_needed == pytest.approx(lateness, abs=0.05)
+
+
+@pytest.mark.parametrize(("imu_follows", "verdict"), [(False, Verdict.WAITING), (True, Verdict.FUSED)])
+def test_a_measurement_ahead_of_the_imu_waits_for_it(recording, imu_follows, verdict):
+    navigator = navigator_for(recording)
+    half = len(recording.imu_stamp) // 2
+    ahead = int(np.searchsorted(recording.fix_stamp, recording.imu_stamp[half]))
+    for part in (slice(0, half), slice(half, None)):
+        navigator.push_imu(recording.imu_stamp[part], recording.specific_force[part], recording.angular_rate[part])
+        if part.start == 0:
+            push(navigator, recording, Message(POSITION, ahead, 0.0, 0))
+            if not imu_follows:
+                break
+    assert navigator.finish()["verdict"].tolist() == [verdict]
+
+
+def test_history_is_bounded_by_time(recording):
+    """A long drive needs no more memory than a short one."""
+    navigator = navigator_for(recording)
+    step = int(recording.imu_stamp[1] - recording.imu_stamp[0])
+    samples = 500
+    for block in range(200):
+        stamps = recording.imu_stamp[0] + step * np.arange(block * samples, (block + 1) * samples)
+        navigator.push_imu(stamps, np.tile([0.0, 0.0, 9.8], (samples, 1)), np.zeros((samples, 3)))
+        navigator.push_gnss_position(int(stamps[-1]), 48.0, 11.0, 500.0, np.eye(3).ravel(), 2, 0)
+        if block == 10:
+            held = navigator.held_bytes
+    assert navigator.held_bytes == held
+
+
+def test_split_and_single_pushes_agree(recording):
+    """One push of many samples is many pushes of one."""
+    whole, single = navigator_for(recording), navigator_for(recording)
+    rows = whole.push_imu(recording.imu_stamp, recording.specific_force, recording.angular_rate)
+    parts = [
+        single.push_imu(
+            recording.imu_stamp[i : i + 1], recording.specific_force[i : i + 1], recording.angular_rate[i : i + 1]
+        )
+        for i in range(len(recording.imu_stamp))
+    ]
+    assert np.concatenate(parts).tobytes() == rows.tobytes()
+
+
+@pytest.mark.parametrize("rate", [0.0, 10.0])
+def test_rows_are_on_the_output_grid(recording, rate):
+    navigator = Navigator(from_mapping(recording.parameters()), output_rate=rate)
+    rows = navigator.push_imu(recording.imu_stamp, recording.specific_force, recording.angular_rate)
+    if rate:
+        assert len(set(rows["stamp"] // round(SECOND / rate))) == len(rows)
+    else:
+        level = recording.imu_stamp >= rows["stamp"][0]
+        assert np.array_equal(rows["stamp"], recording.imu_stamp[level])
+
+
+def test_a_lone_imu_stamp_far_ahead_is_refused(recording):
+    good, bad = navigator_for(recording), navigator_for(recording)
+    half = len(recording.imu_stamp) // 2
+    for part in (slice(0, half), slice(half, None)):
+        arguments = (recording.imu_stamp[part], recording.specific_force[part], recording.angular_rate[part])
+        good.push_imu(*arguments)
+        bad.push_imu(*arguments)
+        if part.start == 0:
+            bad.push_imu(recording.imu_stamp[:1] + 3600 * SECOND, recording.specific_force[:1], np.zeros((1, 3)))
+    assert bad.state.tobytes() == good.state.tobytes()
+    assert bad.imu_counts["bad_stamp"] == 1
