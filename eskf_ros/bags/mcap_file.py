@@ -398,7 +398,7 @@ class McapFile:
     def _walked(self, raw: memoryview, wanted: dict[int, str]) -> dict[str, NDArray[np.int64]]:
         messages = self._walk(raw)
         found = {}
-        for topic in set(wanted.values()):
+        for topic in sorted(set(wanted.values())):
             numbers = [number for number, name in wanted.items() if name == topic]
             offsets = messages.offset[np.isin(messages.channel, numbers)]
             if len(offsets):

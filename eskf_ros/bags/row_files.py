@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
+import struct
+import tempfile
 from collections.abc import Container, Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import IO, TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -85,15 +88,13 @@ class _RowSource:
 
 
 def _unpack(loaded: object) -> dict[str, Payloads]:
-    by_topic: dict[str, tuple[list[int], list[bytes]]] = {}
-    for topic, log_time, data in cast("list[Row]", loaded):
-        times, payloads = by_topic.setdefault(topic, ([], []))
-        times.append(log_time)
-        payloads.append(data)
-    return {
-        topic: Payloads(np.array(times, np.int64), group_by_length(payloads))
-        for topic, (times, payloads) in by_topic.items()
-    }
+    rows = cast("list[Row]", loaded)
+    found = {}
+    for topic in sorted({row[0] for row in rows}):
+        chosen = [row for row in rows if row[0] == topic]
+        log_time = np.array([row[1] for row in chosen], np.int64)
+        found[topic] = Payloads(log_time, group_by_length([row[2] for row in chosen]))
+    return found
 
 
 class SqliteFile(_RowSource):
@@ -110,12 +111,12 @@ class SqliteFile(_RowSource):
         self.bytes_total = path.stat().st_size
         # With a write-ahead log beside it (a recorder that was killed) the newest messages are in there.
         access = "mode=ro" if path.with_name(path.name + "-wal").exists() else "mode=ro&immutable=1"
+        self._copy = _without_partial_page(path)
+        address = (Path(self._copy.name) if self._copy else path.absolute()).as_uri()
         try:
-            self._connection = sqlite3.connect(
-                f"{path.absolute().as_uri()}?{access}", uri=True, check_same_thread=False
-            )
+            self._connection = sqlite3.connect(f"{address}?{access}", uri=True, check_same_thread=False)
             topics = self._connection.execute("SELECT id, name, type FROM topics").fetchall()
-        except sqlite3.Error as error:
+        except (sqlite3.Error, ValueError) as error:  # ValueError: an error text that is no UTF-8 (CPython)
             raise BagError(f"{path}: cannot be read as a rosbag2 sqlite3 file ({error})") from error
         self._names: dict[int, str] = {number: name for number, name, _ in topics}
         self._damaged = False
@@ -142,7 +143,7 @@ class SqliteFile(_RowSource):
             for number, time in self._connection.execute("SELECT topic_id, timestamp FROM messages NOT INDEXED"):
                 count, first, last = counts.get(number, (0, time, time))
                 counts[number] = (count + 1, min(first, time), max(last, time))
-        except (sqlite3.Error, TypeError) as error:
+        except (sqlite3.Error, TypeError, ValueError) as error:
             done = sum(count for count, _, _ in counts.values())
             self.warnings.append(f"{self.name}: damaged after {done} messages ({error}); the messages before are used")
         return counts
@@ -157,13 +158,34 @@ class SqliteFile(_RowSource):
             try:
                 for number, time, data in cursor.execute(query):
                     yield numbers[number], int(time), bytes(data)
-            except sqlite3.Error:
+            except (sqlite3.Error, TypeError, ValueError):
                 if not self._damaged:
                     raise
 
     def close(self) -> None:
         """Close the database."""
         self._connection.close()
+        if self._copy:
+            self._copy.close()
+
+
+def _without_partial_page(path: Path) -> IO[bytes] | None:
+    """A temporary copy without the last page, if that page is cut off.
+
+    sqlite3 would fill it up with zeros and give out the message that lies across the cut as if it were whole.
+    """
+    with path.open("rb") as file:
+        (page_size,) = struct.unpack(">16xH", file.read(18).ljust(18, b"\x00"))
+        page_size = 65536 if page_size == 1 else page_size
+        size = path.stat().st_size
+        if page_size < 512 or size % page_size == 0:
+            return None
+        copy = tempfile.NamedTemporaryFile(suffix=".db3")  # noqa: SIM115 (lives as long as the reader)
+        file.seek(0)
+        shutil.copyfileobj(file, copy)
+    copy.truncate(size - size % page_size)
+    copy.flush()
+    return copy
 
 
 class RosbagsDirectory(_RowSource):
