@@ -575,6 +575,7 @@ def read_whatever(path: Path, content: bytes) -> tuple[list[int], list[list[byte
     try:
         with open_bag([path]) as reader:
             times, found = read(reader, {"/imu/data": IMU})["/imu/data"]
+            assert not any("\n" in line for line in reader.warnings)
             return times, found, reader.warnings
     except BagError as error:
         said = str(error)

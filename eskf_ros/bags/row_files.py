@@ -13,7 +13,7 @@ from typing import IO, TYPE_CHECKING, cast
 
 import numpy as np
 
-from eskf_ros.bags.errors import BagError
+from eskf_ros.bags.errors import BagError, one_line
 from eskf_ros.bags.records import Block, Payloads, TopicInfo, group_by_length
 
 if TYPE_CHECKING:
@@ -77,8 +77,8 @@ class _RowSource:
             except Exception as error:  # any of three libraries, on damaged input: what was read is used
                 total = sum(wanted.values())
                 self.warnings.append(
-                    f"{self.name}: damaged after {done} of {total} messages of {', '.join(wanted)} ({error}); "
-                    "the messages before are used"
+                    f"{self.name}: damaged after {done} of {total} messages of {', '.join(wanted)} "
+                    f"({one_line(error)}); the messages before are used"
                 )
                 return
             if row is None:
@@ -117,7 +117,7 @@ class SqliteFile(_RowSource):
             self._connection = sqlite3.connect(f"{address}?{access}", uri=True, check_same_thread=False)
             topics = self._connection.execute("SELECT id, name, type FROM topics").fetchall()
         except (sqlite3.Error, ValueError) as error:  # ValueError: an error text that is no UTF-8 (CPython)
-            raise BagError(f"{path}: cannot be read as a rosbag2 sqlite3 file ({error})") from error
+            raise BagError(f"{path}: cannot be read as a rosbag2 sqlite3 file ({one_line(error)})") from error
         self._names: dict[int, str] = {number: name for number, name, _ in topics}
         self._damaged = False
         counts: dict[int, tuple[int, int, int]] = {}
@@ -145,7 +145,9 @@ class SqliteFile(_RowSource):
                 counts[number] = (count + 1, min(first, time), max(last, time))
         except (sqlite3.Error, TypeError, ValueError) as error:
             done = sum(count for count, _, _ in counts.values())
-            self.warnings.append(f"{self.name}: damaged after {done} messages ({error}); the messages before are used")
+            self.warnings.append(
+                f"{self.name}: damaged after {done} messages ({one_line(error)}); the messages before are used"
+            )
         return counts
 
     def _rows(self, topics: Container[str]) -> Iterator[Row]:
@@ -205,7 +207,7 @@ class RosbagsDirectory(_RowSource):
             self._reader: Reader = Reader(path)
             self._reader.open()
         except Exception as error:  # damaged input surfaces as many types there
-            raise BagError(f"{path}: {error}") from error
+            raise BagError(f"{path}: {one_line(error)}") from error
         self.topics = {name: TopicInfo(info.msgtype or "", info.msgcount) for name, info in self._reader.topics.items()}
         counted = self._reader.message_count > 0
         self.start_time, self.end_time = (self._reader.start_time, self._reader.end_time - 1) if counted else (0, 0)
