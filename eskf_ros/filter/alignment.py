@@ -29,7 +29,10 @@ from eskf_ros.rotation import (
 START_POSITION_STD = 1000.0
 START_VELOCITY_STD = 100.0
 MOVING_SPEED = 0.5
-"""A speed (m/s) that three sigma above zero proves motion."""
+"""What GNSS has to exceed by three sigma (m/s) to prove motion."""
+
+UNKNOWN_SPEED = 10.0
+"""Levelling in a turn: the speed (m/s) that makes the centripetal acceleration taken for tilt."""
 
 COURSE_MAX_STD = 0.17
 COURSE_MAX_TURN_RATE = 0.2
@@ -115,6 +118,9 @@ def watch_stillness(state, settings):
     if state.window_start == NEVER:
         state.window_start = state.stamp
         state.window_count = 0
+        state.anchor_stamp = state.last_fix_stamp
+        for i in range(3):
+            state.anchor_ecef[i] = state.last_fix_ecef[i]
         for i in range(6):
             state.window_sum[i] = 0.0
             state.window_square_sum[i] = 0.0
@@ -142,6 +148,29 @@ def watch_stillness(state, settings):
         elif state.level_known == 0 and (state.stamp - state.first_stamp) * 1e-9 >= settings.moving_start_after:
             level(state, state.window_sum, state.window_count, duration / state.window_count, False, settings)
     state.window_start = NEVER
+
+
+@njit
+def note_position(state, aid):
+    """Remember a fix, and take a displacement since the window started that three sigma leave as proof of motion."""
+    fix = geodetic_to_ecef(aid.payload[0], aid.payload[1], aid.payload[2])
+    if NEVER < state.anchor_stamp < aid.stamp:
+        a = state.anchor_ecef
+        step = (fix[0] - a[0], fix[1] - a[1], fix[2] - a[2])
+        std = math.sqrt(2.0 * max(aid.payload[3], aid.payload[6], aid.payload[8]))
+        if math.sqrt(dot(step, step)) - 3.0 * std > MOVING_SPEED * (aid.stamp - state.anchor_stamp) * 1e-9:
+            state.motion_stamp = aid.stamp
+    state.last_fix_stamp = aid.stamp
+    for i in range(3):
+        state.last_fix_ecef[i] = fix[i]
+
+
+@njit
+def note_velocity(state, aid):
+    """Take a GNSS velocity that three sigma leave above standstill as proof of motion."""
+    speed = math.sqrt(aid.payload[0] ** 2 + aid.payload[1] ** 2 + aid.payload[2] ** 2)
+    if speed - 3.0 * math.sqrt(max(aid.payload[3], aid.payload[6], aid.payload[8])) > MOVING_SPEED:
+        state.motion_stamp = aid.stamp
 
 
 @njit
@@ -178,9 +207,11 @@ def level(state, sums, count, interval, still, settings):
             covariance[i, j] = 0.0
             covariance[j, i] = 0.0
     accel_bias_variance = settings.accel_bias_std**2
-    tilt_noise = settings.moving_tilt_std**2
     if still:
         tilt_noise = settings.accel_noise_density**2 / (count * interval) / strength**2
+    else:
+        turn_rate_square = (sums[3] ** 2 + sums[4] ** 2 + sums[5] ** 2) / count**2
+        tilt_noise = settings.moving_tilt_std**2 + turn_rate_square * (UNKNOWN_SPEED / strength) ** 2
     heading_variance = math.pi**2
     if state.heading_known == 1:
         heading_variance = settings.initial_heading_std**2
@@ -310,7 +341,7 @@ def start_position(state, payload):
 
 @njit
 def align_to_course(state, settings):
-    """With heading unknown: note proven motion, and take heading from a certain course, the robot driving forward."""
+    """Take the unknown heading from the course, if that is certain and steady; the robot is driving forward."""
     v = state.velocity_map
     speed = math.sqrt(v[0] ** 2 + v[1] ** 2)
     if speed == 0.0:
@@ -322,8 +353,6 @@ def align_to_course(state, settings):
     pyy = covariance[VELOCITY + 1, VELOCITY + 1]
     along_variance = along[0] ** 2 * pxx + 2.0 * along[0] * along[1] * pxy + along[1] ** 2 * pyy
     across_variance = along[1] ** 2 * pxx - 2.0 * along[0] * along[1] * pxy + along[0] ** 2 * pyy
-    if speed - 3.0 * math.sqrt(along_variance) > MOVING_SPEED:
-        state.motion_stamp = state.stamp
     course_variance = across_variance / speed**2
     up = local_up(state)
     rate = (

@@ -96,7 +96,12 @@ STATE = np.dtype(
         ("position_known", "i8"),
         ("heading_known", "i8"),
         ("first_stamp", "i8"),
+        # External evidence of motion: when GNSS last proved it, the last fix, and the one the window started from.
         ("motion_stamp", "i8"),
+        ("last_fix_stamp", "i8"),
+        ("last_fix_ecef", "f8", (3,)),
+        ("anchor_stamp", "i8"),
+        ("anchor_ecef", "f8", (3,)),
         # Stillness: sums over the window being filled, and over the unbroken run of still windows before it.
         ("window_start", "i8"),
         ("window_count", "i8"),
@@ -250,10 +255,13 @@ def allocate(dtype: np.dtype, count: int = 1) -> np.ndarray:
     return memory if COMPILED else memory.view(np.recarray)
 
 
+_EVIDENCE = ("motion_stamp", "last_fix_stamp", "anchor_stamp")
+
+
 def blank_state() -> np.ndarray:
     """Return the state before the first IMU sample."""
     state = allocate(STATE)
-    for field in ("stamp", "imu_stamp", "first_stamp", "motion_stamp", "window_start", "absolute_stamp"):
+    for field in ("stamp", "imu_stamp", "first_stamp", "window_start", "absolute_stamp", *_EVIDENCE):
         state[field] = NEVER
     state["attitude"][0, 0] = 1.0
     return state

@@ -13,6 +13,8 @@ from eskf_ros.compiled import njit
 from eskf_ros.filter.aiding import gnss_position, gnss_velocity
 from eskf_ros.filter.alignment import (
     align_to_course,
+    note_position,
+    note_velocity,
     restart,
     set_datum,
     start_position,
@@ -151,6 +153,10 @@ def fuse(state, aids, i, settings, work):
     if is_duplicate(aids, i):
         aid.verdict = DUPLICATE
         return
+    if aid.stream == GNSS_POSITION:
+        note_position(state, aid)
+    elif aid.stream == GNSS_VELOCITY:
+        note_velocity(state, aid)
     if state.level_known == 0 or (state.position_known == 0 and aid.stream != GNSS_POSITION):
         aid.verdict = BEFORE_ALIGNMENT
         return

@@ -1,0 +1,290 @@
+"""The navigator at its door and on its way up the ladder: bad input, start-up, holes in the data."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from eskf_ros.earth import ecef_to_geodetic
+from eskf_ros.filter.layout import ODOMETRY, RECORD, Status, Verdict
+from eskf_ros.filter.navigator import Navigator
+from eskf_ros.parameters import from_mapping
+from eskf_ros.simulate.scenario import Recording, simulate
+
+SECOND = 1_000_000_000
+GOOD_COVARIANCE = np.diag([1.0, 1.0, 4.0]).ravel()
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    return simulate("drive", seed=1, imu_rate=100.0, start=12.0, stop=52.0)
+
+
+def run(recording: Recording, hole: tuple[float, float] = (0.0, 0.0), gnss_from: float = 0.0, **parameters: object):
+    """Give a recording in stamp order; IMU samples inside ``hole`` (s from the start) are missing."""
+    navigator = Navigator(from_mapping({**recording.parameters(), **parameters}))
+    rows = []
+    start = int(recording.imu_stamp[0])
+    first = 0
+    for epoch, stamp in enumerate([*recording.fix_stamp, recording.imu_stamp[-1]]):
+        last = int(np.searchsorted(recording.imu_stamp, stamp, side="right"))
+        seconds = (recording.imu_stamp[first:last] - start) / SECOND
+        kept = slice(first, last) if not hole[1] else first + np.flatnonzero((seconds < hole[0]) | (seconds > hole[1]))
+        rows.append(
+            navigator.push_imu(recording.imu_stamp[kept], recording.specific_force[kept], recording.angular_rate[kept])
+        )
+        first = last
+        if (stamp - start) / SECOND < gnss_from or epoch == len(recording.fix_stamp):
+            continue
+        navigator.push_gnss_position(
+            int(stamp),
+            float(recording.fix_latitude_deg[epoch]),
+            float(recording.fix_longitude_deg[epoch]),
+            float(recording.fix_altitude[epoch]),
+            recording.fix_covariance[epoch],
+            2,
+            0,
+        )
+        navigator.push_gnss_velocity(int(stamp), recording.velocity_enu[epoch], recording.velocity_covariance[epoch])
+    return navigator, np.concatenate(rows)
+
+
+def truth_at(recording: Recording, rows: np.ndarray, field: str) -> np.ndarray:
+    return getattr(recording, field)[np.searchsorted(recording.truth_stamp, rows["stamp"])]
+
+
+def on_truth(recording: Recording, rows: np.ndarray) -> np.ndarray:
+    return rows[np.isin(rows["stamp"], recording.truth_stamp)]
+
+
+def test_the_ladder_is_climbed_in_order(recording):
+    _, rows = run(recording, gnss_from=4.0)
+    climbed = [Status(int(status)) for status in rows["status"][np.r_[True, np.diff(rows["status"]) != 0]]]
+    assert climbed[:2] == [Status.WAITING_FIX, Status.WAITING_HEADING]
+    assert climbed[2] == Status.ALIGNING
+    assert climbed[-1] == Status.GOOD
+    # Published from the start of levelling: no row before the attitude is level.
+    assert rows["stamp"][0] > recording.imu_stamp[0] + 1.9 * SECOND
+
+
+def test_while_heading_is_unknown_position_is_fused_and_yaw_variance_is_a_half_turn(recording):
+    _, rows = run(recording)
+    waiting = on_truth(recording, rows[rows["status"] == Status.WAITING_HEADING])
+    assert len(waiting) > 100
+    assert np.allclose(np.sqrt(waiting["pose_covariance"][:, 5, 5]), math.pi, rtol=1e-3)
+    settled = waiting[100:]
+    error = settled["position_map"] - truth_at(recording, settled, "truth_position_map")
+    sigma = np.sqrt(np.einsum("nii->ni", settled["pose_covariance"])[:, :3])
+    assert np.all(np.abs(error) < 4.0 * sigma)
+    # Honest is not the same as useless.
+    assert np.median(sigma) < 2.0
+
+
+@pytest.mark.parametrize("heading_deg", [None, 35.0])
+def test_heading_from_course_or_parameter(recording, heading_deg):
+    mapping = {} if heading_deg is None else {"alignment.initial_heading_deg": heading_deg}
+    _, rows = run(recording, **mapping)
+    known = rows[rows["heading_known"]]
+    if heading_deg is not None:
+        assert known["stamp"][0] < recording.imu_stamp[0] + 3 * SECOND
+    final = on_truth(recording, known)[-1:]
+    w, x, y, z = (truth_at(recording, final, "truth_attitude_body_to_map")[0, i] for i in range(4))
+    true_heading = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    w, x, y, z = final["attitude_body_to_map"][0]
+    heading = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    error = math.remainder(heading - true_heading, 2 * math.pi)
+    assert abs(error) < 4 * math.sqrt(final["pose_covariance"][0, 5, 5])
+    assert abs(error) < math.radians(3.0)
+
+
+def test_start_while_driving_needs_no_stop():
+    moving = simulate("drive", seed=2, imu_rate=100.0, start=60.0, stop=110.0)
+    assert np.linalg.norm(moving.truth_velocity_map[0]) > 5.0
+    _, rows = run(moving)
+    assert rows["status"][-1] == Status.GOOD
+    last = on_truth(moving, rows)[-500:]
+    error = last["position_map"] - truth_at(moving, last, "truth_position_map")
+    assert np.sqrt(np.mean(np.sum(error[:, :2] ** 2, axis=1))) < 1.0
+
+
+def test_the_datum_is_the_first_accepted_fix_and_stays(recording):
+    navigator, _ = run(recording, datum=[], gnss_from=3.0)
+    first = int(np.searchsorted(recording.fix_stamp, recording.imu_stamp[0] + 3 * SECOND))
+    assert navigator.datum == pytest.approx(
+        (recording.fix_latitude_deg[first], recording.fix_longitude_deg[first], recording.fix_altitude[first]), abs=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    ("hole", "longest_error"), [((30.0, 30.3), 2.0), ((30.0, 32.0), 8.0)], ids=["short hole", "long hole"]
+)
+def test_a_hole_in_the_imu_data_is_bridged_with_honest_covariance(recording, hole, longest_error):
+    _, rows = run(recording, hole=hole)
+    after = on_truth(recording, rows[rows["stamp"] > recording.imu_stamp[0] + hole[1] * SECOND])
+    error = after["position_map"] - truth_at(recording, after, "truth_position_map")
+    variance = np.einsum("nii->ni", after["pose_covariance"])[:, :3]
+    assert np.all(np.isfinite(after["position_map"]))
+    assert np.abs(error).max() < longest_error
+    assert np.mean(error**2 / variance) < 4.0
+
+
+def test_after_a_silence_too_long_to_bridge_it_starts_again(recording):
+    _, rows = run(recording, hole=(26.0, 33.0))
+    after = rows[rows["stamp"] > recording.imu_stamp[0] + 33 * SECOND]
+    assert after["status"][0] < Status.ALIGNING
+    assert after["status"][-1] >= Status.ALIGNING
+    known = on_truth(recording, after[after["heading_known"]])
+    error = known["position_map"] - truth_at(recording, known, "truth_position_map")
+    assert np.abs(error).max() < 3.0
+
+
+def offer_position(navigator: Navigator, stamp: int, **changes: object) -> None:
+    message = {
+        "latitude_deg": 48.137,
+        "longitude_deg": 11.575,
+        "altitude": 565.0,
+        "covariance": GOOD_COVARIANCE,
+        "covariance_type": 2,
+        "status": 0,
+    }
+    navigator.push_gnss_position(stamp, **{**message, **changes})
+
+
+@pytest.mark.parametrize(
+    ("changes", "verdict"),
+    [
+        ({"latitude_deg": math.nan}, Verdict.NON_FINITE),
+        ({"altitude": math.inf}, Verdict.NON_FINITE),
+        ({"covariance": np.full(9, math.nan)}, Verdict.NON_FINITE),
+        ({"covariance": np.diag([1.0, -1.0, 1.0]).ravel()}, Verdict.BAD_COVARIANCE),
+        ({"covariance": np.array([1.0, 2.0, 0, 2.0, 1.0, 0, 0, 0, 1.0])}, Verdict.BAD_COVARIANCE),
+        ({"latitude_deg": 91.0}, Verdict.BAD_VALUE),
+        ({"status": -1}, Verdict.NO_FIX),
+        ({"latitude_deg": 48.2}, Verdict.GATE),
+    ],
+)
+def test_a_bad_fix_is_named_and_never_touches_the_state(recording, changes, verdict):
+    navigator, _ = run(recording)
+    navigator.take_records()
+    navigator.update()
+    before = navigator.state
+    offer_position(navigator, int(recording.imu_stamp[-1]) - 1, **changes)
+    navigator.update()
+    assert navigator.finish()["verdict"][-1] == verdict
+    after = navigator.state
+    for field in ("position_map", "velocity_map", "attitude", "accel_bias", "gyro_bias"):
+        assert np.allclose(after[field], before[field], rtol=0, atol=1e-12), field
+
+
+@pytest.mark.parametrize("stamp", [0, -5])
+def test_a_stamp_of_zero_is_refused(recording, stamp):
+    navigator, _ = run(recording)
+    offer_position(navigator, stamp)
+    navigator.push_imu(np.array([stamp]), np.array([[0.0, 0.0, 9.8]]), np.zeros((1, 3)))
+    assert navigator.finish()["verdict"][-1] == Verdict.BAD_STAMP
+    assert navigator.imu_counts["bad_stamp"] == 1
+
+
+def test_a_stamp_seconds_away_is_refused(recording):
+    navigator, _ = run(recording)
+    offer_position(navigator, int(recording.imu_stamp[-1]) + 11 * SECOND)
+    offer_position(navigator, int(recording.imu_stamp[-1]) - 11 * SECOND)
+    assert navigator.finish()["verdict"][-2:].tolist() == [Verdict.BAD_STAMP, Verdict.OUTSIDE_HISTORY]
+
+
+@pytest.mark.parametrize("status", [0, 1, 2])
+def test_an_unknown_covariance_takes_the_table(recording, status):
+    """An all-zero covariance, and NaN declared unknown, have the sigma of the table for their status."""
+    stamp = int(recording.imu_stamp[-1]) - 1
+    nis = []
+    for covariance, covariance_type in ((np.zeros(9), 2), (np.full(9, math.nan), 0), (None, 2)):
+        navigator, _ = run(recording)
+        navigator.take_records()
+        gnss = navigator.parameters.gnss
+        if covariance is None:
+            horizontal, vertical = gnss.status_std_horizontal[status], gnss.status_std_vertical[status]
+            covariance = np.diag([horizontal**2, horizontal**2, vertical**2]).ravel()
+        latitude, longitude, altitude = geodetic_of(navigator)
+        offer_position(
+            navigator,
+            stamp,
+            latitude_deg=latitude + 5e-6,
+            longitude_deg=longitude,
+            altitude=altitude,
+            covariance=covariance,
+            covariance_type=covariance_type,
+            status=status,
+        )
+        navigator.update()
+        nis.append(navigator.finish()["nis"][-1])
+    assert nis[0] == nis[1] == nis[2]
+
+
+def geodetic_of(navigator: Navigator) -> tuple[float, float, float]:
+    state = navigator.state[0]
+    ecef = state["origin_ecef"] + state["map_to_ecef"] @ state["position_map"]
+    latitude, longitude, altitude = ecef_to_geodetic(*ecef)
+    return math.degrees(latitude), math.degrees(longitude), altitude
+
+
+def test_a_floor_lifts_an_over_confident_covariance(recording):
+    """Three millimetres reported with a metre of error: with a floor of a metre it is fused, with none it is not."""
+    verdicts = []
+    for floor in (0.001, 1.0):
+        navigator, _ = run(recording, **{"gnss.position_std_floor": floor, "gnss.use_velocity": True})
+        navigator.take_records()
+        latitude, longitude, altitude = geodetic_of(navigator)
+        offer_position(
+            navigator,
+            int(recording.imu_stamp[-1]) - 1,
+            latitude_deg=latitude + 2.5 / 111e3,
+            longitude_deg=longitude,
+            altitude=altitude,
+            covariance=np.diag([9e-6] * 3).ravel(),
+        )
+        navigator.update()
+        verdicts.append(navigator.finish()["verdict"][-1])
+    assert verdicts == [Verdict.GATE, Verdict.FUSED]
+
+
+ANY_FLOAT = st.floats(allow_nan=True, allow_infinity=True, width=64)
+
+
+@settings(max_examples=150)
+@given(
+    values=st.lists(ANY_FLOAT, min_size=3, max_size=3),
+    covariance=st.lists(st.one_of(ANY_FLOAT, st.floats(-2.0, 2.0)), min_size=9, max_size=9),
+    covariance_type=st.integers(0, 3),
+    status=st.integers(-2, 2),
+    force=st.lists(ANY_FLOAT, min_size=6, max_size=6),
+)
+def test_no_message_makes_the_state_non_finite(warm_navigator, values, covariance, covariance_type, status, force):
+    """Whatever numbers arrive, what is published stays finite and the covariance positive."""
+    navigator = warm_navigator
+    stamp = int(navigator.state["imu_stamp"][0])
+    navigator.push_gnss_position(stamp, *values, covariance, covariance_type, status)
+    navigator.push_gnss_velocity(stamp, values, covariance)
+    navigator.push_imu(np.array([stamp + 10_000_000]), np.array([force[:3]]), np.array([force[3:]]))
+    navigator.push_imu(np.array([stamp + 20_000_000]), np.array([[0.0, 0.0, 9.8]]), np.zeros((1, 3)))
+    row = navigator.odometry[0]
+    for field in ("position_map", "velocity_map", "attitude_body_to_map", "pose_covariance", "twist_covariance"):
+        assert np.all(np.isfinite(row[field])), field
+    assert np.linalg.eigvalsh(row["pose_covariance"]).min() > 0.0
+    navigator.take_records()
+
+
+@pytest.fixture(scope="module")
+def warm_navigator(recording):
+    return run(recording)[0]
+
+
+def test_shapes_are_what_they_are_said_to_be(recording):
+    navigator, rows = run(recording)
+    assert rows.dtype == ODOMETRY
+    assert navigator.take_records().dtype == RECORD
+    assert np.array_equal(rows["pose_covariance"], rows["pose_covariance"].transpose(0, 2, 1))
+    assert np.array_equal(rows["twist_covariance"], rows["twist_covariance"].transpose(0, 2, 1))
