@@ -465,6 +465,16 @@ def test_missing_and_empty_recordings(tmp_path: Path) -> None:
         BagWriter(tmp_path / "nowhere" / "a.mcap")
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+@pytest.mark.parametrize("count", [1, 20_000])
+def test_a_full_disk_is_said(count: int) -> None:
+    with (
+        pytest.raises(BagError, match=r"/dev/full: cannot be written .No space left"),
+        BagWriter(Path("/dev/full")) as w,
+    ):
+        w.write(w.add_topic("/odom", ODOMETRY), log_times(count), random_messages(ODOMETRY, count), FRAMES)
+
+
 def test_wrong_topics_types_and_encodings_are_named(tmp_path: Path) -> None:
     path = tmp_path / "bag.mcap"
     write_ours(path)

@@ -346,34 +346,28 @@ class McapFile:
                 yield self._block(chunk, wanted)
 
     def _block(self, chunk: _Chunk, wanted: dict[int, str]) -> Block:
-        def load() -> tuple[memoryview, bytes] | _Damage:
+        def load() -> dict[str, Payloads]:
             try:
                 with self.path.open("rb") as file:
                     record = self._read_at(file, chunk.offset, chunk.length + chunk.index_length)
                 if chunk.loose:
-                    return memoryview(record), b""
-                incomplete = chunk.offset + chunk.length > self.bytes_total
-                raw, _, _ = _open_chunk(record[: chunk.length] if chunk.index_length else record, incomplete)
-                return raw, record[chunk.length :]
-            except _Damage as damage:
-                return damage
-            except OSError as error:
-                return _Damage(str(error))
-
-        def unpack(loaded: object) -> dict[str, Payloads]:
-            if isinstance(loaded, _Damage):
-                self._skipped[chunk.offset] = str(loaded)
+                    raw = memoryview(record)
+                else:
+                    incomplete = chunk.offset + chunk.length > self.bytes_total
+                    raw, _, _ = _open_chunk(memoryview(record)[: chunk.length], incomplete)
+            except (_Damage, OSError) as error:
+                self._skipped[chunk.offset] = str(error)
                 return {}
-            raw, index = cast("tuple[memoryview, bytes]", loaded)
+            index = memoryview(record)[chunk.length :]
             found = self._indexed(raw, index, chunk, wanted) if chunk.index_offsets else None
             if found is None:
                 found = self._walked(raw, wanted)
             return {topic: _payloads(raw, offsets) for topic, offsets in found.items()}
 
-        return Block(min(chunk.start, _LAST_TIME), chunk.offset, chunk.length + chunk.index_length, load, unpack)
+        return Block(min(chunk.start, _LAST_TIME), chunk.offset, chunk.length + chunk.index_length, load)
 
     def _indexed(
-        self, raw: memoryview, index: bytes, chunk: _Chunk, wanted: dict[int, str]
+        self, raw: memoryview, index: memoryview, chunk: _Chunk, wanted: dict[int, str]
     ) -> dict[str, NDArray[np.int64]] | None:
         """Offsets of the messages of each wanted topic by the message index; None if that does not fit the chunk."""
         found: dict[str, list[NDArray[np.int64]]] = {}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -129,37 +128,31 @@ class BagReader:
         pending: dict[str, list[_Piece]] = {topic: [] for topic in topics}
         waiting = 0
         emitted = np.iinfo(np.int64).min  # every message before this time has been given out
-        with ThreadPoolExecutor(1) as worker:
-            blocks = self._blocks(topics)
+        blocks = self._blocks(topics)
+        following = next(blocks, None)
+        while following:
+            order, block = following
+            loaded = block.load()
             following = next(blocks, None)
-            loading = worker.submit(following[1].load) if following else None
-            while following and loading:
-                order, block = following
-                loaded = loading.result()
-                # The next block is read and decompressed while the messages of this one are decoded.
-                following = next(blocks, None)
-                loading = worker.submit(following[1].load) if following else None
-                for topic, payloads in block.unpack(loaded).items():
-                    piece, bad = self._decode(topics[topic], payloads, order)
-                    if bad:
-                        malformed[topic] = malformed.get(topic, 0) + bad
-                    late = int(np.searchsorted(piece.log_time, emitted))
-                    if late:
-                        misplaced += late
-                        piece = _Piece(order, piece.log_time[late:], piece.messages[late:])
-                    if len(piece.log_time):
-                        pending[topic].append(piece)
-                        waiting += len(piece.log_time)
-                del loaded
-                self.bytes_done += block.size
-                if following is None or (waiting >= _BATCH_MESSAGES and following[1].start > emitted):
-                    until = following[1].start if following else None
-                    batch = self._take(pending, until)
-                    waiting = sum(len(piece.log_time) for pieces in pending.values() for piece in pieces)
-                    if batch:
-                        # With nothing left to read, nothing can be late any more.
-                        emitted = until if until is not None else emitted
-                        yield batch
+            for topic, payloads in loaded.items():
+                piece, bad = self._decode(topics[topic], payloads, order)
+                if bad:
+                    malformed[topic] = malformed.get(topic, 0) + bad
+                late = int(np.searchsorted(piece.log_time, emitted))
+                if late:
+                    misplaced += late
+                    piece = _Piece(order, piece.log_time[late:], piece.messages[late:])
+                if len(piece.log_time):
+                    pending[topic].append(piece)
+                    waiting += len(piece.log_time)
+            self.bytes_done += block.size
+            if following is None or (waiting >= _BATCH_MESSAGES and following[1].start > emitted):
+                until = following[1].start if following else None
+                batch = self._take(pending, until)
+                waiting = sum(len(piece.log_time) for pieces in pending.values() for piece in pieces)
+                if batch:
+                    emitted = until if until is not None else emitted
+                    yield batch
         self.bytes_done = self.bytes_total
         for topic, count in malformed.items():
             self._own_warnings.append(

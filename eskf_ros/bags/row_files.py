@@ -6,10 +6,10 @@ import shutil
 import sqlite3
 import struct
 import tempfile
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, cast
+from typing import IO, TYPE_CHECKING
 
 import numpy as np
 
@@ -47,10 +47,10 @@ class _RowSource:
         first = next(rows, None)
         position = 0
 
-        def load() -> list[Row]:
+        def load() -> dict[str, Payloads]:
             nonlocal first
             if first is None:
-                return []
+                return {}
             block, size = [first], len(first[2])
             first = None
             for row in rows:
@@ -59,13 +59,13 @@ class _RowSource:
                     break
                 block.append(row)
                 size += len(row[2])
-            return block
+            return _by_topic(block)
 
         while first is not None:
             count = min(remaining, _ROWS_PER_BLOCK)
             remaining -= count
             position += 1
-            yield Block(first[1], position, int(count * bytes_per_row), load, _unpack)
+            yield Block(first[1], position, int(count * bytes_per_row), load)
 
     def _survivors(self, wanted: Mapping[str, int]) -> Iterator[Row]:
         """The rows up to the first damage, which becomes a warning."""
@@ -87,8 +87,7 @@ class _RowSource:
             yield row
 
 
-def _unpack(loaded: object) -> dict[str, Payloads]:
-    rows = cast("list[Row]", loaded)
+def _by_topic(rows: Sequence[Row]) -> dict[str, Payloads]:
     found = {}
     for topic in sorted({row[0] for row in rows}):
         chosen = [row for row in rows if row[0] == topic]
@@ -114,7 +113,7 @@ class SqliteFile(_RowSource):
         self._copy = _without_partial_page(path)
         address = (Path(self._copy.name) if self._copy else path.absolute()).as_uri()
         try:
-            self._connection = sqlite3.connect(f"{address}?{access}", uri=True, check_same_thread=False)
+            self._connection = sqlite3.connect(f"{address}?{access}", uri=True)
             topics = self._connection.execute("SELECT id, name, type FROM topics").fetchall()
         except (sqlite3.Error, ValueError) as error:  # ValueError: an error text that is no UTF-8 (CPython)
             raise BagError(f"{path}: cannot be read as a rosbag2 sqlite3 file ({one_line(error)})") from error

@@ -104,9 +104,8 @@ class BagWriter:
         try:
             self._file: BinaryIO = path.open("wb")
         except OSError as error:
-            raise BagError(f"{path}: cannot be written ({error.strerror})") from error
-        self._file.write(MAGIC)
-        self._file.write(_record(Header("ros2", "eskf_ros")))
+            raise self._failure(error) from error
+        self._put(MAGIC + _record(Header("ros2", "eskf_ros")))
 
     def __enter__(self) -> BagWriter:
         return self
@@ -135,11 +134,11 @@ class BagWriter:
             definition, _ = store.generate_msgdef(type_name, ros_version=2)
             schema = Schema(len(self._schemas) + 1, definition.encode(), "ros2msg", type_name)
             self._schemas[type_name] = schema
-            self._file.write(_record(schema))
+            self._put(_record(schema))
         number = len(self._topics) + 1
         metadata = {"offered_qos_profiles": "", "topic_type_hash": type_hash}
         self._channels.append(Channel(number, name, "cdr", metadata, self._schemas[type_name].id))
-        self._file.write(_record(self._channels[-1]))
+        self._put(_record(self._channels[-1]))
         self._topics.append(_Topic(number, name, type_name, type_hash))
         return number - 1
 
@@ -300,7 +299,10 @@ class BagWriter:
         try:
             return self._file.write(data)
         except OSError as error:
-            raise BagError(f"{self.path}: cannot be written ({error.strerror})") from error
+            raise self._failure(error) from error
+
+    def _failure(self, error: OSError) -> BagError:
+        return BagError(f"{self.path}: cannot be written ({error.strerror})")
 
     def close(self) -> None:
         """Write what waits, the index and the footer.
@@ -344,7 +346,10 @@ class BagWriter:
         footer = _record(Footer(summary_start, offsets_start, 0))
         checksum = zlib.crc32(summary + offsets + footer[:-4])
         self._put(summary + offsets + _record(Footer(summary_start, offsets_start, checksum)) + MAGIC)
-        self._file.close()
+        try:
+            self._file.close()
+        except OSError as error:
+            raise self._failure(error) from error
 
     def _rosbag2_metadata(self) -> str:
         """What `ros2 bag` keeps in metadata.yaml, as JSON (which YAML includes)."""
