@@ -91,8 +91,8 @@ DRIVE_PARAMETERS = f"""\
       mount_position: [0.0, 0.0, 0.65]
       mount_rpy_deg: [0.0, -6.8, 174.9]
       # Vibration of roof and engine.
-      gyro_noise_density: 2.6e-3
-      accel_noise_density: 0.02
+      gyro_noise_density: 3.5e-3
+      accel_noise_density: 0.03
       gyro_bias_random_walk: 1.0e-5
       accel_bias_random_walk: 3.0e-4
     gnss:
