@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import io
 import shutil
@@ -454,7 +455,7 @@ def test_missing_and_empty_recordings(tmp_path: Path) -> None:
         writer.add_topic("/imu/data", IMU)
     with pytest.raises(BagError, match="holds no messages"):
         open_bag([tmp_path / "empty.mcap"])
-    with sqlite3.connect(tmp_path / "other.db3") as database:
+    with contextlib.closing(sqlite3.connect(tmp_path / "other.db3")) as database:
         database.execute("CREATE TABLE people(name TEXT)")
     with pytest.raises(BagError, match="no such table: topics"):
         open_bag([tmp_path / "other.db3"])

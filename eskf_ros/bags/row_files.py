@@ -114,7 +114,11 @@ class SqliteFile(_RowSource):
         address = (Path(self._copy.name) if self._copy else path.absolute()).as_uri()
         try:
             self._connection = sqlite3.connect(f"{address}?{access}", uri=True)
-            topics = self._connection.execute("SELECT id, name, type FROM topics").fetchall()
+            try:
+                topics = self._connection.execute("SELECT id, name, type FROM topics").fetchall()
+            except BaseException:
+                self._connection.close()
+                raise
         except (sqlite3.Error, ValueError) as error:  # ValueError: an error text that is no UTF-8 (CPython)
             raise BagError(f"{path}: cannot be read as a rosbag2 sqlite3 file ({one_line(error)})") from error
         self._names: dict[int, str] = {number: name for number, name, _ in topics}
