@@ -1,0 +1,231 @@
+"""Strapdown navigation against an integration in the inertial frame that shares nothing with it but gravity."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import pytest
+from inertial_oracle import Inputs, MapState, integrate
+from kernels import make_settings, make_state, make_work, run_samples, to_rotation
+from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
+from scipy.spatial.transform import Rotation
+
+from eskf_ros.filter.strapdown import LONGEST_STEP, SECOND, gravity_map
+from eskf_ros.simulate.imu import ideal_samples
+from eskf_ros.simulate.map_frame import MapFrame
+from eskf_ros.simulate.scenario import DATUM, trajectory
+
+Array = NDArray[np.float64]
+
+# A gap longer than any here: what a hole in the data costs is tested with the covariance.
+SETTINGS = make_settings(imu__gap=10.0)
+WORK = make_work()
+
+
+def shaking(t: float) -> tuple[Array, Array]:
+    """A body that turns about all axes out of phase: coning, sculling, and every term of the equations at work."""
+    force = np.array([1.5 * math.sin(2.1 * t), 2.0 * math.cos(1.7 * t + 0.3), 9.8 + 1.2 * math.sin(2.6 * t)])
+    rate = np.array([0.7 * math.cos(2.4 * t), 0.6 * math.sin(2.1 * t + 0.5), 0.3 + 0.5 * math.cos(1.3 * t)])
+    return force, rate
+
+
+def samples_of(inputs: Inputs, stamps: NDArray[np.int64]) -> tuple[Array, Array]:
+    readings = [inputs(stamp / SECOND) for stamp in stamps]
+    return np.array([reading[0] for reading in readings]), np.array([reading[1] for reading in readings])
+
+
+def navigate(start: tuple[Any, Any, Rotation], datum: Any, stamps: NDArray[np.int64], force: Array, rate: Array) -> Any:
+    """Return the state after all samples."""
+    state = make_state(start[0], start[1], start[2], datum)
+    run_samples(state, stamps, force, rate, SETTINGS, WORK)
+    return state
+
+
+def departures(state: Any, truth: MapState) -> tuple[float, float, float]:
+    """Return how far a state is off the last row of the truth: m, m/s, rad."""
+    turn = to_rotation(truth.attitude_body_to_map[-1]).inv() * to_rotation(state["attitude"])
+    return (
+        float(np.linalg.norm(state["position_map"] - truth.position_map[-1])),
+        float(np.linalg.norm(state["velocity_map"] - truth.velocity_map[-1])),
+        float(turn.magnitude()),
+    )
+
+
+SHAKING_START = (
+    np.array([100.0, -50.0, 20.0]),
+    np.array([20.0, 5.0, -1.0]),
+    Rotation.from_euler("xyz", [0.3, -0.2, 2.0]),
+)
+SHAKING_DATUM = (-33.0, 151.0, 40.0)
+SHAKING_SECONDS = 30
+
+
+@lru_cache
+def shaking_truth() -> MapState:
+    position, velocity, attitude = SHAKING_START
+    start = (position, velocity, attitude.as_quat()[[3, 0, 1, 2]])
+    return integrate(shaking, start, SHAKING_DATUM, [0.0, float(SHAKING_SECONDS)])
+
+
+def stamps_at(rate_hz: int, seconds: float) -> NDArray[np.int64]:
+    return np.round(np.arange(int(seconds * rate_hz) + 1) * (SECOND / rate_hz)).astype(np.int64)
+
+
+def test_error_is_of_second_order_in_the_imu_interval() -> None:
+    """Half the interval, a quarter of the error, in position, velocity and attitude alike."""
+    errors = []
+    for rate_hz in (50, 100, 200, 400):
+        stamps = stamps_at(rate_hz, SHAKING_SECONDS)
+        state = navigate(SHAKING_START, SHAKING_DATUM, stamps, *samples_of(shaking, stamps))
+        errors.append(departures(state, shaking_truth()))
+    ratios = np.array(errors[:-1]) / np.array(errors[1:])
+    assert (ratios > 3.6).all(), (errors, ratios)
+    assert (ratios < 4.4).all(), (errors, ratios)
+    np.testing.assert_array_less(errors[-1], (0.02, 1e-3, 2e-5))
+
+
+def test_intervals_may_be_split_anywhere() -> None:
+    """Aids at stamps of their own cut intervals, the readings interpolated: the error keeps its order and its size."""
+    rng = np.random.default_rng(2)
+    differences, errors = [], []
+    for rate_hz in (50, 100, 200):
+        stamps = stamps_at(rate_hz, SHAKING_SECONDS)
+        force, rate = samples_of(shaking, stamps)
+        plain = navigate(SHAKING_START, SHAKING_DATUM, stamps, force, rate)
+        cuts = np.unique(np.concatenate([stamps, rng.integers(0, stamps[-1], len(stamps)), stamps[1:50] - 1]))
+        cut_force, cut_rate = (
+            np.stack([np.interp(cuts, stamps, readings[:, axis]) for axis in range(3)], axis=-1)
+            for readings in (force, rate)
+        )
+        split = navigate(SHAKING_START, SHAKING_DATUM, cuts, cut_force, cut_rate)
+        assert split["stamp"] == plain["stamp"]
+        differences.append(float(np.linalg.norm(split["position_map"] - plain["position_map"])))
+        errors.append(departures(plain, shaking_truth())[0])
+    # Second order: what splitting changes shrinks with the square of the interval, and is no more than the error.
+    assert differences[0] / differences[1] > 3.0
+    assert differences[1] / differences[2] > 3.0
+    assert all(difference < error for difference, error in zip(differences, errors)), (differences, errors)
+
+
+def test_long_intervals_are_cut() -> None:
+    """Constant readings over a second, as across a hole in the data, give what 50 steps give."""
+    force, rate = np.array([0.4, -0.2, 9.8]), np.array([0.02, -0.3, 0.5])
+    few = np.array([0, SECOND], dtype=np.int64)
+    many = np.arange(0, SECOND + 1, LONGEST_STEP, dtype=np.int64)
+    ends = [
+        navigate(
+            SHAKING_START, SHAKING_DATUM, stamps, np.tile(force, (len(stamps), 1)), np.tile(rate, (len(stamps), 1))
+        )
+        for stamps in (few, many)
+    ]
+    np.testing.assert_allclose(ends[0]["position_map"], ends[1]["position_map"], rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(ends[0]["attitude"], ends[1]["attitude"], rtol=0.0, atol=1e-15)
+    np.testing.assert_allclose(ends[0]["covariance"], ends[1]["covariance"], rtol=1e-10, atol=1e-20)
+
+
+@pytest.mark.parametrize("offset", [(50e3, 0.0, -196.0), (-30e3, 40e3, -196.0), (0.0, -900e3, -63e3)])
+def test_far_from_the_datum_nothing_is_approximated(offset: tuple[float, float, float]) -> None:
+    """``map`` is rigid: the same second order 50 km and even 900 km from its origin."""
+    position = np.array(offset)
+    start = (position, SHAKING_START[1], SHAKING_START[2])
+    truth = integrate(shaking, (*start[:2], start[2].as_quat()[[3, 0, 1, 2]]), SHAKING_DATUM, [0.0, 10.0])
+    errors = []
+    for rate_hz in (200, 400):
+        stamps = stamps_at(rate_hz, 10.0)
+        errors.append(departures(navigate(start, SHAKING_DATUM, stamps, *samples_of(shaking, stamps)), truth))
+    ratios = np.array(errors[0]) / np.array(errors[1])
+    assert (abs(ratios - 4.0) < 0.4).all(), (errors, ratios)
+    assert errors[1][0] < 2e-3
+
+
+def test_gravity_without_a_datum_points_down() -> None:
+    state = make_state(datum=None)
+    assert gravity_map(state, (5.0, 6.0, 7.0)) == (0.0, 0.0, -9.80665)
+
+
+def test_standing_on_the_turning_earth() -> None:
+    """A body at rest that reads gravity and Earth rate exactly stays where it is for ten minutes."""
+    attitude = Rotation.from_euler("xyz", [0.1, -0.3, 1.0])
+    state = make_state((2000.0, 1000.0, 30.0), attitude=attitude)
+    gravity = np.array(gravity_map(state, (2000.0, 1000.0, 30.0)))
+    stamps = stamps_at(100, 600.0)
+    force = np.tile(attitude.inv().apply(-gravity), (len(stamps), 1))
+    rate = np.tile(attitude.inv().apply(state["earth_rate_map"]), (len(stamps), 1))
+    run_samples(state, stamps, force, rate, SETTINGS, WORK)
+    # Rounding of 60 000 attitudes tilts by 1e-12 rad.
+    np.testing.assert_allclose(state["position_map"], (2000.0, 1000.0, 30.0), rtol=0.0, atol=5e-6)
+    assert (to_rotation(state["attitude"]) * attitude.inv()).magnitude() < 1e-11
+
+
+class DriveInputs:
+    """The ideal IMU of a drive as smooth splines from joint to joint, quick enough for a differential equation."""
+
+    def __init__(self, name: str, seconds: float) -> None:
+        self.path = trajectory(name)
+        joints = self.path.breakpoints
+        self.joints = np.append(joints[joints < seconds], seconds)
+        frame = MapFrame(DATUM)
+        self._splines = []
+        for begin, end in zip(self.joints[:-1], self.joints[1:]):
+            times = np.linspace(begin, end, max(12, math.ceil((end - begin) * 60.0)))
+            readings = np.hstack(ideal_samples(self.path, frame, times))
+            self._splines.append(make_interp_spline(times, readings, k=7))
+
+    def __call__(self, t: float) -> tuple[Array, Array]:
+        piece = min(max(int(np.searchsorted(self.joints, t, side="right")) - 1, 0), len(self._splines) - 1)
+        reading = self._splines[piece](t)
+        return reading[:3], reading[3:]
+
+
+@lru_cache
+def ten_minutes() -> tuple[DriveInputs, tuple[Any, Any, Rotation], MapState]:
+    """Return the inputs of ten minutes of city laps, the state at their start and, by integration, at their end."""
+    seconds = 600.0
+    inputs = DriveInputs("hour_drive", seconds)
+    probe = np.random.default_rng(1).uniform(0.0, seconds, 500)
+    exact = np.hstack(ideal_samples(inputs.path, MapFrame(DATUM), probe))
+    np.testing.assert_allclose([np.hstack(inputs(t)) for t in probe], exact, rtol=0.0, atol=2e-9)
+    motion = inputs.path.motion([0.0])
+    begin = (motion.position_map[0], motion.velocity_map[0], motion.attitude_body_to_map[0])
+    truth = integrate(inputs, begin, DATUM, [0.0, seconds], inputs.joints)
+    return inputs, (begin[0], begin[1], to_rotation(begin[2])), truth
+
+
+@lru_cache
+def ten_minutes_error(rate_hz: int, true_means: bool) -> tuple[float, float, float]:
+    """Return the departures after ten minutes of ideal samples.
+
+    ``true_means``: of samples changed by a twelfth of their second difference, so that the straight line from one to
+    the next has the mean of the true signal, to fourth order. That takes the loss by sampling out of the figure.
+    """
+    inputs, start, truth = ten_minutes()
+    stamps = stamps_at(rate_hz, 600.0)
+    readings = np.hstack(ideal_samples(inputs.path, MapFrame(DATUM), stamps * 1e-9))
+    if true_means:
+        readings[1:-1] -= np.diff(readings, 2, axis=0) / 12.0
+    force, rate = (np.ascontiguousarray(part) for part in (readings[:, :3], readings[:, 3:]))
+    return departures(navigate(start, DATUM, stamps, force, rate), truth)
+
+
+@pytest.mark.slow
+def test_ten_minutes_of_the_drive_are_of_second_order() -> None:
+    """Half the interval, a quarter of the error, nearly all of it from the signal being taken as linear."""
+    coarse, fine = ten_minutes_error(500, False), ten_minutes_error(1000, False)
+    assert 3.6 < coarse[0] / fine[0] < 4.4, (coarse, fine)
+    assert fine[0] < 0.012, fine
+
+
+@pytest.mark.slow
+def test_ten_minutes_of_the_drive_at_1_khz_with_true_means_are_within_a_millimetre() -> None:
+    """What the strapdown itself adds to the sampling, coning, sculling, Coriolis and gravity included, is 0.03 mm."""
+    assert ten_minutes_error(1000, True)[0] < 1e-4
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason="linear in between costs 11 mm: the coning of what the line leaves out")
+def test_ten_minutes_of_the_drive_at_1_khz_are_within_a_millimetre() -> None:
+    assert ten_minutes_error(1000, False)[0] < 1e-3
