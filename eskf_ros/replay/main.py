@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from rich.console import Console
+    from rich.table import Table
 
     from eskf_ros.parameters import Parameters
 
@@ -38,6 +39,23 @@ ROS 1 bags: `rosbags-convert --src IN.bag --dst OUT` makes a ROS 2 bag of one.
 
 class _Mistake(Exception):
     """A mistake of the user; the text is one line."""
+
+
+class _Stopped(BaseException):
+    """Ctrl-C or `kill`.
+
+    Not KeyboardInterrupt: one that passes an import of a dataclass makes Python die of SIGINT although it is caught.
+    """
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+
+_STOPPING = (signal.SIGINT, signal.SIGTERM)
+
+
+def _stop(number: int, frame: object) -> NoReturn:
+    raise _Stopped(number)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -124,21 +142,23 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit code: 0, 2 for what the user can mend, 130 after Ctrl-C."""
+    """Run the command; returns the exit code: 0, 2 for what the user can mend, 130 after Ctrl-C, 143 after `kill`."""
+    previous = [signal.signal(number, _stop) for number in _STOPPING]
     try:
-        # `kill` and timeouts leave no half-written files either.
-        signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
         return _run(_parser().parse_args(arguments))
     except _Mistake as mistake:
         _say(f"error: {mistake}")
         return 2
-    except KeyboardInterrupt:
-        _say("interrupted; no results were written")
-        return 130
+    except _Stopped as stopped:
+        _say("interrupted; nothing is written for the recording in progress")
+        return 128 + stopped.number
     except BrokenPipeError:
         # The reader of stdout has gone, as in `eskf_replay ... | head`.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    finally:
+        for number, handler in zip(_STOPPING, previous, strict=True):
+            signal.signal(number, handler)
 
 
 def _say(text: str) -> None:
@@ -229,24 +249,22 @@ def _write_json(target: str, content: Any) -> None:
 
 def _show(console: Console, summary: dict[str, Any], folder: Path) -> None:
     """Print the tables."""
-    from rich import box
-    from rich.table import Table
-
     duration, imu_count = summary["duration_s"], summary["imu_count"]
     rate = (imu_count - 1) / duration if duration > 0.0 else 0.0
     console.print(
         f"{summary['bag']}: {duration:.1f} s, IMU {rate:.1f} Hz, replayed in {summary['wall_s']:.2f} s "
         f"({summary['realtime_factor']:.0f} times real time), at the end {summary['final']['status']}",
         highlight=False,
+        soft_wrap=True,
     )
     counted = ("offered", "fused", "rejected", "late", "withheld")
-    aids = Table("aid", *counted, "NIS", "in 95 %", box=box.SIMPLE)
+    aids = _table("aid", *counted, "NIS", "in 95 %")
     for name, aid in summary["aids"].items():
         counts = [str(aid[key]) for key in counted]
         aids.add_row(name, *counts, _rounded(aid["nis_mean"], ".2f"), _rounded(aid["nis_in_95"], ".1%"))
     console.print(aids)
     if "error" in summary:
-        errors = Table("error against truth", "rms", "50 %", "95 %", "largest", box=box.SIMPLE)
+        errors = _table("error against truth", "rms", "50 %", "95 %", "largest")
         units = {"horizontal": "m", "vertical": "m", "speed": "m/s", "heading_deg": "deg"}
         for name, unit in units.items():
             error = summary["error"][name] or {}
@@ -257,14 +275,23 @@ def _show(console: Console, summary: dict[str, Any], folder: Path) -> None:
             if nees:
                 console.print(f"NEES {name}: mean {nees['mean']:.2f} (ideal 3), in 95 %: {nees['in_95']:.1%}")
     if summary["outages"]:
-        outages = Table(
-            "outage", "length, s", "driven, m", "horizontal, m", "vertical, m", "heading, deg", box=box.SIMPLE
-        )
+        outages = _table("outage", "s", "driven, m", "error: horizontal, m", "vertical, m", "heading, deg")
         for outage in summary["outages"]:
             at_end = [_rounded(outage.get(key), ".2f") for key in ("horizontal", "vertical", "heading_deg")]
             outages.add_row(f"at {outage['start']:g} s", f"{outage['length']:g}", f"{outage['distance']:.0f}", *at_end)
         console.print(outages)
     console.print(f"Results: {folder}", highlight=False, soft_wrap=True)
+
+
+def _table(*headings: str) -> Table:
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column(headings[0], no_wrap=True)
+    for heading in headings[1:]:
+        table.add_column(heading, justify="right", no_wrap=True)
+    return table
 
 
 def _rounded(value: float | None, form: str) -> str:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
+import time
 from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Any
 
@@ -17,6 +19,7 @@ from numpy.typing import NDArray
 from eskf_ros.bags import BagWriter, message_dtype
 from eskf_ros.filter.layout import STREAM_NAMES, Verdict
 from eskf_ros.parameters import Frames
+from eskf_ros.replay.digits import tum_text
 from eskf_ros.replay.topics import FIX, ODOMETRY
 from eskf_ros.simulate.map_frame import MapFrame, to_geodetic
 
@@ -25,80 +28,97 @@ AIDS_HEADER = "stamp,arrival,aid,innovation_0,innovation_1,innovation_2,nis,dof,
 FIX_INTERVAL = 1_000_000_000
 """ns between two NavSatFix messages in odometry.mcap."""
 
+VERDICT_NAMES = tuple(verdict.name.lower() for verdict in Verdict)
+
 _STATUS_FIX = 0
 _COVARIANCE_KNOWN = 3
 
 
 class ResultFiles:
-    """Context manager: on a clean exit the results replace those of an earlier replay, after an error none is left.
+    """Context manager: `write_summary` replaces the results of an earlier replay; without it nothing is left.
 
     Only files called as in `NAMES` are ever replaced. With `output_rate` above 0 (Hz) the rows are thinned to it, as
     the navigator would: the first row at or after each multiple of the interval. Raises OSError or BagError when the
-    folder cannot be written.
+    folder cannot be written. `seconds` is the time the writing thread has worked.
     """
 
     def __init__(self, folder: Path, frames: Frames, output_rate: float = 0.0) -> None:
         self.folder = folder
         self._strings = (frames.map, frames.base_link)
         self._interval = round(1e9 / output_rate) if output_rate else 0
-        self._last_stamp = -1
-        self._open = ExitStack()
+        self._last_stamp = self._last_fix = -1
+        self._writing: Future[None] | None = None
+        self.seconds = 0.0
+        self._all = ExitStack()
+        self._files = ExitStack()
 
     def __enter__(self) -> ResultFiles:
         self._is_new = not self.folder.exists()
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._partial = {name: self.folder / f".{name}.{os.getpid()}" for name in NAMES}
         try:
-            self._bag = self._open.enter_context(BagWriter(self._partial["odometry.mcap"]))
+            # A folder, not other names: odometry.mcap holds its own name.
+            self._partial = Path(self._all.enter_context(TemporaryDirectory(prefix=".partial-", dir=self.folder)))
+            self._all.enter_context(self._files)
+            self._bag = self._files.enter_context(BagWriter(self._partial / "odometry.mcap"))
             self._odometry = self._bag.add_topic("odometry/global", ODOMETRY)
             self._fixes = self._bag.add_topic("gps/filtered", FIX)
-            self._trajectory = self._open.enter_context(self._partial["trajectory.tum"].open("w", encoding="ascii"))
-            self._aids = self._open.enter_context(self._partial["aids.csv"].open("w", encoding="ascii"))
+            self._trajectory = self._files.enter_context((self._partial / "trajectory.tum").open("wb"))
+            self._aids = self._files.enter_context((self._partial / "aids.csv").open("w", encoding="ascii"))
             self._aids.write(AIDS_HEADER)
+            self._writer = self._files.enter_context(ThreadPoolExecutor(1))
         except BaseException:
             self.__exit__(*sys.exc_info())
             raise
         return self
 
-    def write_rows(self, rows: NDArray[Any], datum: tuple[float, float, float] | None) -> None:
-        """Append those of the ODOMETRY rows (n,) whose position is known to trajectory.tum and odometry.mcap."""
-        stamps, known = rows["stamp"], rows["position_known"]
-        if datum is None or not known.any():
-            self._last_stamp = int(stamps[-1]) if len(stamps) else self._last_stamp
-            return
-        chosen = rows[known & _first_in_each(stamps, self._last_stamp, self._interval)]
-        self._trajectory.write(tum_lines(chosen))
-        self._bag.write(self._odometry, chosen["stamp"], odometry_messages(chosen), self._strings)
-        chosen = rows[known & _first_in_each(stamps, self._last_stamp, FIX_INTERVAL)]
-        self._bag.write(self._fixes, chosen["stamp"], fix_messages(chosen, MapFrame(datum)), self._strings)
-        self._last_stamp = int(stamps[-1])
+    def write(self, rows: NDArray[Any], records: NDArray[Any], datum: tuple[float, float, float] | None) -> None:
+        """Append RECORD rows (m,) to aids.csv, and ODOMETRY rows (n,) whose position is known to the other two files.
 
-    def write_records(self, records: NDArray[Any]) -> None:
-        """Append RECORD rows (n,) to aids.csv."""
+        The work is done by a thread, mostly outside Python, while the estimator takes the next batch.
+        """
+        self._wait()
+        self._writing = self._writer.submit(self._write, rows, records, datum)
+
+    def _write(self, rows: NDArray[Any], records: NDArray[Any], datum: tuple[float, float, float] | None) -> None:
+        began = time.perf_counter()
         self._aids.write(aids_lines(records))
+        stamps, known = rows["stamp"], rows["position_known"]
+        if datum is not None and known.any():
+            chosen = rows[known & _first_in_each(stamps, self._last_stamp, self._interval)]
+            numbers = np.column_stack([chosen["position_map"], chosen["attitude_body_to_map"][:, [1, 2, 3, 0]]])
+            self._trajectory.write(tum_text(chosen["stamp"], numbers))
+            self._bag.write(self._odometry, chosen["stamp"], odometry_messages(chosen), self._strings)
+            chosen = chosen[_first_in_each(chosen["stamp"], self._last_fix, FIX_INTERVAL)]
+            self._bag.write(self._fixes, chosen["stamp"], fix_messages(chosen, MapFrame(datum)), self._strings)
+            self._last_fix = int(chosen["stamp"][-1]) if len(chosen) else self._last_fix
+        if len(rows):
+            self._last_stamp = int(stamps[-1])
+        self.seconds += time.perf_counter() - began
+
+    def _wait(self) -> None:
+        if self._writing is not None:
+            self._writing.result()
+
+    def finish(self) -> None:
+        """Complete all files but summary.json; nothing can be appended any more."""
+        self._wait()
+        began = time.perf_counter()
+        self._files.close()
+        self.seconds += time.perf_counter() - began
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
-        """Write summary.json; what is NaN must have become None before."""
+        """Write summary.json, after `finish`, and give all files their names; what is NaN must have become None."""
         text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
-        self._partial["summary.json"].write_text(text, encoding="utf-8")
-
-    def close(self) -> None:
-        """Finish all files but summary.json; nothing can be appended any more."""
-        self._open.close()
+        (self._partial / "summary.json").write_text(text, encoding="utf-8")
+        for name in NAMES:
+            (self._partial / name).replace(self.folder / name)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        try:
-            self._open.__exit__(kind, error, trace)
-            if kind is None:
-                for name, partial in self._partial.items():
-                    partial.replace(self.folder / name)
-        finally:
-            for partial in self._partial.values():
-                partial.unlink(missing_ok=True)
-            if self._is_new and not any(self.folder.iterdir()):
-                self.folder.rmdir()
+        self._all.__exit__(kind, error, trace)
+        if self._is_new and not any(self.folder.iterdir()):
+            self.folder.rmdir()
 
 
 def _first_in_each(stamps: NDArray[np.int64], last: int, interval: int) -> NDArray[np.bool_]:
@@ -111,21 +131,13 @@ def _first_in_each(stamps: NDArray[np.int64], last: int, interval: int) -> NDArr
     return np.diff(stamps // interval, prepend=last // interval) > 0
 
 
-def tum_lines(rows: NDArray[Any]) -> str:
-    """Lines of a TUM trajectory: `t x y z qx qy qz qw`, t in seconds with all nine decimals of the stamp."""
-    seconds, nanoseconds = np.divmod(rows["stamp"], 1_000_000_000)
-    columns = [seconds, nanoseconds, *rows["position_map"].T, *rows["attitude_body_to_map"][:, [1, 2, 3, 0]].T]
-    line = "%d.%09d %.6f %.6f %.6f %.9f %.9f %.9f %.9f\n"
-    return "".join(map(line.__mod__, zip(*(column.tolist() for column in columns), strict=True)))
-
-
 def aids_lines(records: NDArray[Any]) -> str:
     """Lines of aids.csv; stamps in seconds with nine decimals, numbers with all digits, nan where there is none."""
     stamp, arrival = np.divmod(records["stamp"], 1_000_000_000), np.divmod(records["arrival"], 1_000_000_000)
     columns = [column.tolist() for column in (*stamp, *arrival)]
     columns.append([STREAM_NAMES[stream] for stream in records["stream"].tolist()])
     columns += [column.tolist() for column in (*records["innovation"].T, records["nis"], records["dof"])]
-    columns.append([Verdict(verdict).name.lower() for verdict in records["verdict"].tolist()])
+    columns.append([VERDICT_NAMES[verdict] for verdict in records["verdict"].tolist()])
     line = "%d.%09d,%d.%09d,%s,%r,%r,%r,%r,%d,%s\n"
     return "".join(map(line.__mod__, zip(*columns, strict=True)))
 

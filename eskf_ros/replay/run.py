@@ -88,9 +88,9 @@ def replay(
                 if len(known) and topics.truth and datum:
                     truth.add_rows(known, datum)
                 summary.add(known, records)
-                files.write_rows(rows, datum)
-                files.write_records(records)
-                clock.lap("write")
+                clock.lap("compare")
+                files.write(rows, records, datum)
+                clock.lap("wait")
 
             clock.lap("start")
             for batch in feed.ordered(reader.batches(topics.wanted())):
@@ -103,8 +103,8 @@ def replay(
                 progress(reader.bytes_done / reader.bytes_total)
             clock.lap("read")
             collect(np.zeros(0, ODOMETRY), navigator.finish())
-            files.close()
-            clock.lap("write")
+            files.finish()
+            clock.lap("wait")
             compared = truth.compared() if topics.truth else None
             result = {
                 "bag": str(bag),
@@ -114,7 +114,7 @@ def replay(
                 **({} if compared is None else truth_result(topics.truth, truth.offered, compared)),
                 "outages": summary.outages(compared),
                 "warnings": [*reader.warnings, *hints, *summary.warnings(navigator, topics, parameters)],
-                "timing": clock.stages | {"total": clock.total()},
+                "timing": clock.stages | {"write": files.seconds, "total": clock.total()},
             }
             files.write_summary(result)
     return result

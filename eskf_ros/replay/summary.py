@@ -85,8 +85,12 @@ class Summary:
             "withheld": self._feed.withheld[stream],
             "nis_mean": float(self._nis_sum[stream] / tested) if tested else None,
             "nis_in_95": float(self._nis_inside[stream] / tested) if tested else None,
-            "verdicts": {verdict.name.lower(): int(verdicts[verdict]) for verdict in Verdict if verdicts[verdict]},
+            "verdicts": self._verdict_counts(stream),
         }
+
+    def _verdict_counts(self, stream: Stream) -> dict[str, int]:
+        counts = self._verdicts[stream]
+        return {verdict.name.lower(): int(counts[verdict]) for verdict in Verdict if counts[verdict]}
 
     def outages(self, compared: NDArray[Any] | None) -> list[dict[str, Any]]:
         """For each outage the length of the estimated path and, with truth, the errors at its last compared epoch."""
@@ -115,7 +119,12 @@ class Summary:
                 f"a window of {navigator.window_needed:.3f} s would have taken them"
             )
         if not self._rows:
-            lines.append(f"no position was found; what became of the fixes of {topics.gnss_fix} stands in aids.csv")
+            verdicts = ", ".join(
+                f"{count} {name}" for name, count in self._verdict_counts(Stream.GNSS_POSITION).items()
+            )
+            lines.append(
+                f"no position was found; what became of the fixes of {topics.gnss_fix}: {verdicts or 'none came'}"
+            )
         return lines
 
 
@@ -123,7 +132,12 @@ def truth_result(topic: str, offered: int, compared: NDArray[Any]) -> dict[str, 
     """`truth`, `error` and `nees`: COMPARED rows (n,) out of `offered` truth epochs."""
     nees = {"position": compared["nees_position"], "attitude": compared["nees_attitude"]}
     return {
-        "truth": {"topic": topic, "epochs": offered, "compared": len(compared)},
+        "truth": {
+            "topic": topic,
+            "epochs": offered,
+            "compared": len(compared),
+            "heading_compared": int(np.isfinite(compared["heading_deg"]).sum()),
+        },
         "error": {name: _error(compared[name]) for name in ("horizontal", "vertical", "speed", "heading_deg")},
         "nees": {name: _consistency(values) for name, values in nees.items()},
     }
