@@ -114,19 +114,19 @@ class Imu:
         maximum=360.0,
     )
     gyro_noise_density: float = _parameter(
-        2.0e-4,
+        1.5e-3,
         "rad/s/rtHz",
-        "White noise of the gyro. The default is 0.0115 deg/s/rtHz (0.69 deg/rt h), a consumer MEMS IMU; "
-        "industrial MEMS have about 0.5e-4, tactical grade 0.1e-4 and less.",
+        "White noise of the gyro as mounted. The default, 0.0859 deg/s/rtHz (5.16 deg/rt h), is for a consumer MEMS IMU shaken by "
+        "engine and road; a data sheet says 2e-4 (consumer), 0.5e-4 (industrial), 0.1e-4 and less (tactical): use that on a smooth vehicle.",
         above=0.0,
         maximum=1.0,
         live=True,
     )
     accel_noise_density: float = _parameter(
-        2.0e-3,
+        3.0e-2,
         "m/s2/rtHz",
-        "White noise of the accelerometer. The default is 200 ug/rtHz, a consumer MEMS IMU; industrial MEMS have "
-        "about 0.6e-3. Vibration that the sampling folds into the data counts as noise: on a rough vehicle go higher.",
+        "White noise of the accelerometer as mounted. The default, 3060 ug/rtHz, is for a consumer MEMS IMU shaken "
+        "by engine and road; a data sheet says 2e-3 (consumer), 0.6e-3 (industrial): use that on a smooth vehicle.",
         above=0.0,
         maximum=10.0,
         live=True,
@@ -309,7 +309,7 @@ class Alignment:
         maximum=600.0,
     )
     still_gyro_std: float = _parameter(
-        0.02,
+        0.06,
         "rad/s",
         "Standard deviation of the angular rate within static_duration, per axis, below which the IMU counts as still. "
         "The default lets a car with its engine running pass.",
@@ -317,7 +317,7 @@ class Alignment:
         maximum=10.0,
     )
     still_accel_std: float = _parameter(
-        0.3,
+        0.4,
         "m/s2",
         "Standard deviation of the specific force within static_duration, per axis, below which the IMU counts as "
         "still. The default lets a car with its engine running pass.",

@@ -31,6 +31,9 @@ START_VELOCITY_STD = 100.0
 MOVING_SPEED = 0.5
 """What GNSS has to exceed by three sigma (m/s) to prove motion."""
 
+STRONGEST_START = 5.0
+"""No robot gathers speed faster (m/s2)."""
+
 UNKNOWN_SPEED = 10.0
 """Levelling in a turn: the speed (m/s) that makes the centripetal acceleration taken for tilt."""
 
@@ -98,12 +101,15 @@ def shortest_turn(a, b):
 
 @njit
 def restart(state):
-    """Forget everything but the datum and the biases: the IMU was silent for too long to bridge."""
+    """Start the alignment again; only the datum stays."""
+    state.restarts += 1
+    state.rejected_fixes = 0
     state.level_known = 0
     state.position_known = 0
     state.heading_known = 0
     state.first_stamp = NEVER
     state.window_start = NEVER
+    state.still_stamp = NEVER
     state.still_count = 0
     for i in range(3):
         state.position_map[i] = 0.0
@@ -113,8 +119,11 @@ def restart(state):
 @njit
 def watch_stillness(state, settings):
     """Add the newest IMU sample to the stillness window; at the end of a window level if that is still wanted."""
-    if state.first_stamp == NEVER:
+    if state.first_stamp == NEVER or state.imu_interval > settings.imu_gap:
+        # What a hole hides belongs to no window.
         state.first_stamp = state.stamp
+        state.window_start = NEVER
+        state.still_count = 0
     if state.window_start == NEVER:
         state.window_start = state.stamp
         state.window_count = 0
@@ -136,14 +145,16 @@ def watch_stillness(state, settings):
     still = is_still(state, settings) and state.motion_stamp < state.window_start
     if not still:
         state.still_count = 0
-        for i in range(6):
-            state.still_sum[i] = 0.0
     else:
+        if state.still_count == 0:
+            for i in range(6):
+                state.still_sum[i] = 0.0
         state.still_count += state.window_count
         for i in range(6):
             state.still_sum[i] += state.window_sum[i]
     if state.heading_known == 0 or state.position_known == 0:
         if still:
+            state.still_stamp = state.stamp
             level(state, state.still_sum, state.still_count, duration / state.window_count, True, settings)
         elif state.level_known == 0 and (state.stamp - state.first_stamp) * 1e-9 >= settings.moving_start_after:
             level(state, state.window_sum, state.window_count, duration / state.window_count, False, settings)
@@ -151,26 +162,59 @@ def watch_stillness(state, settings):
 
 
 @njit
-def note_position(state, aid):
-    """Remember a fix, and take a displacement since the window started that three sigma leave as proof of motion."""
+def note_position(state, aid, settings):
+    """Remember a fix, and look at the displacement since the one before the current stillness window."""
     fix = geodetic_to_ecef(aid.payload[0], aid.payload[1], aid.payload[2])
     if NEVER < state.anchor_stamp < aid.stamp:
         a = state.anchor_ecef
         step = (fix[0] - a[0], fix[1] - a[1], fix[2] - a[2])
         std = math.sqrt(2.0 * max(aid.payload[3], aid.payload[6], aid.payload[8]))
-        if math.sqrt(dot(step, step)) - 3.0 * std > MOVING_SPEED * (aid.stamp - state.anchor_stamp) * 1e-9:
-            state.motion_stamp = aid.stamp
+        seconds = (aid.stamp - state.anchor_stamp) * 1e-9
+        note_speed(state, (math.sqrt(dot(step, step)) - 3.0 * std) / seconds, state.anchor_stamp, aid.stamp, settings)
     state.last_fix_stamp = aid.stamp
     for i in range(3):
         state.last_fix_ecef[i] = fix[i]
 
 
 @njit
-def note_velocity(state, aid):
-    """Take a GNSS velocity that three sigma leave above standstill as proof of motion."""
+def note_velocity(state, aid, settings):
+    """Look at a GNSS velocity."""
     speed = math.sqrt(aid.payload[0] ** 2 + aid.payload[1] ** 2 + aid.payload[2] ** 2)
-    if speed - 3.0 * math.sqrt(max(aid.payload[3], aid.payload[6], aid.payload[8])) > MOVING_SPEED:
-        state.motion_stamp = aid.stamp
+    std = math.sqrt(max(aid.payload[3], aid.payload[6], aid.payload[8]))
+    note_speed(state, speed - 3.0 * std, aid.stamp, aid.stamp, settings)
+
+
+@njit
+def note_speed(state, speed, since, stamp, settings):
+    """Take a speed (m/s) that three sigma leave, the mean from ``since`` to ``stamp``, as proof of motion.
+
+    If no robot can have gathered that speed since the last window that passed as still, that window was none.
+    """
+    if speed <= MOVING_SPEED:
+        return
+    state.motion_stamp = stamp
+    waiting = state.heading_known == 0 and state.level_known == 1 and state.still_stamp != NEVER
+    if waiting and speed > MOVING_SPEED + STRONGEST_START * (stamp - min(since, state.still_stamp)) * 1e-9:
+        distrust_level(state, settings)
+
+
+@njit
+def distrust_level(state, settings):
+    """Give tilt and gyro bias the uncertainty of a level taken while moving."""
+    state.still_stamp = NEVER
+    state.still_count = 0
+    up = local_up(state)
+    covariance = state.covariance
+    for i in range(3):
+        state.gyro_bias[i] = 0.0
+        for j in range(ERROR_SIZE):
+            covariance[GYRO_BIAS + i, j] = 0.0
+            covariance[j, GYRO_BIAS + i] = 0.0
+        for j in range(3):
+            covariance[ATTITUDE + i, ATTITUDE + j] -= up[i] * up[j] * settings.moving_tilt_std**2
+        covariance[ATTITUDE + i, ATTITUDE + i] += settings.moving_tilt_std**2
+    for i in range(3):
+        covariance[GYRO_BIAS + i, GYRO_BIAS + i] = settings.gyro_bias_std**2
 
 
 @njit

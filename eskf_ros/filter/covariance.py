@@ -10,7 +10,8 @@ Error dynamics of the local Earth-fixed frame with the attitude error theta on t
 
 One interval is integrated to second order: the attitude error of mid-interval enters the velocity, the mean of old
 and new velocity error the position. That is a transition of nine rows which never becomes a matrix: it is applied to
-the rows of P, and again to the rows of the transpose of the result.
+the columns of P, and again to the columns of the transpose of the result. The bias rows do not change, so the second
+round has nine columns only.
 """
 
 from __future__ import annotations
@@ -19,17 +20,17 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import SEMI_MAJOR_AXIS
-from eskf_ros.filter.layout import ATTITUDE, ERROR_SIZE
+from eskf_ros.filter.layout import ACCEL_BIAS, ATTITUDE, ERROR_SIZE
 from eskf_ros.rotation import rotate
 
 
 @njit
-def apply_transition(rows, out, rotation, force, up, gravity_gradient, earth_rate, dt, coupling):
-    """Write the transition of one interval times ``rows`` to ``out`` (both error size x error size).
+def apply_transition(columns, out, count, rotation, force, up, gravity_gradient, earth_rate, dt, coupling):
+    """Write the nine moving rows of one interval's transition times the first ``count`` columns to ``out``.
 
-    ``rotation`` body to map at mid-interval, ``force`` specific force (m/s2, map), ``up`` unit vector (map),
-    ``gravity_gradient`` gravity over Earth radius (1/s2), ``earth_rate`` (rad/s, map), ``dt`` in s. ``coupling`` 0 cuts
-    velocity off from attitude and accelerometer bias (unknown heading), 1 is the full model.
+    ``columns`` has error size rows. ``rotation`` body to map at mid-interval, ``force`` specific force (m/s2, map),
+    ``up`` unit vector (map), ``gravity_gradient`` gravity over Earth radius (1/s2), ``earth_rate`` (rad/s, map), ``dt``
+    in s. ``coupling`` 0 cuts velocity off from attitude and accelerometer bias (unknown heading), 1 is the full model.
     """
     r00, r01, r02 = rotation[0][0] * dt, rotation[0][1] * dt, rotation[0][2] * dt
     r10, r11, r12 = rotation[1][0] * dt, rotation[1][1] * dt, rotation[1][2] * dt
@@ -41,56 +42,48 @@ def apply_transition(rows, out, rotation, force, up, gravity_gradient, earth_rat
     half = 0.5 * dt * coupling
     fx, fy, fz = half * force[0], half * force[1], half * force[2]
     ex, ey, ez = earth_rate[0] * dt, earth_rate[1] * dt, earth_rate[2] * dt
+    cx, cy, cz = 2.0 * ex, 2.0 * ey, 2.0 * ez
     ux, uy, uz = up[0], up[1], up[2]
     gradient = gravity_gradient * dt
+    wx, wy, wz = 3.0 * gradient * ux, 3.0 * gradient * uy, 3.0 * gradient * uz
     h = 0.5 * dt
-    for j in range(ERROR_SIZE):
-        px, py, pz = rows[0, j], rows[1, j], rows[2, j]
-        vx, vy, vz = rows[3, j], rows[4, j], rows[5, j]
-        tx, ty, tz = rows[6, j], rows[7, j], rows[8, j]
-        ax, ay, az = rows[9, j], rows[10, j], rows[11, j]
-        gx, gy, gz = rows[12, j], rows[13, j], rows[14, j]
+    for j in range(count):
+        px, py, pz = columns[0, j], columns[1, j], columns[2, j]
+        vx, vy, vz = columns[3, j], columns[4, j], columns[5, j]
+        tx, ty, tz = columns[6, j], columns[7, j], columns[8, j]
+        ax, ay, az = columns[9, j], columns[10, j], columns[11, j]
+        gx, gy, gz = columns[12, j], columns[13, j], columns[14, j]
         new_tx = tx - (r00 * gx + r01 * gy + r02 * gz) - (ey * tz - ez * ty)
         new_ty = ty - (r10 * gx + r11 * gy + r12 * gz) - (ez * tx - ex * tz)
         new_tz = tz - (r20 * gx + r21 * gy + r22 * gz) - (ex * ty - ey * tx)
         sx, sy, sz = tx + new_tx, ty + new_ty, tz + new_tz
-        vertical = 3.0 * (ux * px + uy * py + uz * pz)
+        vertical = ux * px + uy * py + uz * pz
         new_vx = (
             vx
             + (sy * fz - sz * fy)
             - (a00 * ax + a01 * ay + a02 * az)
-            - 2.0 * (ey * vz - ez * vy)
-            + gradient * (vertical * ux - px)
+            - (cy * vz - cz * vy)
+            + (wx * vertical - gradient * px)
         )
         new_vy = (
             vy
             + (sz * fx - sx * fz)
             - (a10 * ax + a11 * ay + a12 * az)
-            - 2.0 * (ez * vx - ex * vz)
-            + gradient * (vertical * uy - py)
+            - (cz * vx - cx * vz)
+            + (wy * vertical - gradient * py)
         )
         new_vz = (
             vz
             + (sx * fy - sy * fx)
             - (a20 * ax + a21 * ay + a22 * az)
-            - 2.0 * (ex * vy - ey * vx)
-            + gradient * (vertical * uz - pz)
+            - (cx * vy - cy * vx)
+            + (wz * vertical - gradient * pz)
         )
         out[0, j] = px + h * (vx + new_vx)
         out[1, j] = py + h * (vy + new_vy)
         out[2, j] = pz + h * (vz + new_vz)
         out[3, j], out[4, j], out[5, j] = new_vx, new_vy, new_vz
         out[6, j], out[7, j], out[8, j] = new_tx, new_ty, new_tz
-        out[9, j], out[10, j], out[11, j] = ax, ay, az
-        out[12, j], out[13, j], out[14, j] = gx, gy, gz
-
-
-@njit
-def transpose(matrix):
-    """Transpose a square matrix in place."""
-    for i in range(ERROR_SIZE):
-        for j in range(i):
-            matrix[i, j], matrix[j, i] = matrix[j, i], matrix[i, j]
 
 
 @njit
@@ -116,12 +109,18 @@ def propagate_covariance(covariance, rotation, force, gravity, earth_rate, dt, c
     strength = math.sqrt(gravity[0] * gravity[0] + gravity[1] * gravity[1] + gravity[2] * gravity[2])
     up = (-gravity[0] / strength, -gravity[1] / strength, -gravity[2] / strength)
     gradient = strength / SEMI_MAJOR_AXIS
-    apply_transition(covariance, work.half, rotation, force, up, gradient, earth_rate, dt, coupling)
-    transpose(work.half)
-    apply_transition(work.half, covariance, rotation, force, up, gradient, earth_rate, dt, coupling)
-    for i in range(ERROR_SIZE):
+    half = work.half
+    apply_transition(covariance, half, ERROR_SIZE, rotation, force, up, gradient, earth_rate, dt, coupling)
+    for i in range(ACCEL_BIAS):
+        for j in range(ERROR_SIZE):
+            work.turned[j, i] = half[i, j]
+    apply_transition(work.turned, covariance, ACCEL_BIAS, rotation, force, up, gradient, earth_rate, dt, coupling)
+    for i in range(ACCEL_BIAS):
         for j in range(i):
             covariance[i, j] = covariance[j, i]
+        for j in range(ACCEL_BIAS, ERROR_SIZE):
+            covariance[i, j] = half[i, j]
+            covariance[j, i] = half[i, j]
 
 
 @njit

@@ -107,11 +107,14 @@ STATE = np.dtype(
         ("window_count", "i8"),
         ("window_sum", "f8", (6,)),
         ("window_square_sum", "f8", (6,)),
+        ("still_stamp", "i8"),
         ("still_count", "i8"),
         ("still_sum", "f8", (6,)),
-        # When absolute aids were last accepted.
+        # When absolute aids were last accepted, how many were rejected since, and how often that ended in a restart.
         ("absolute_stamp", "i8"),
         ("absolute_interval", "i8"),
+        ("rejected_fixes", "i8"),
+        ("restarts", "i8"),
     ],
     align=True,
 )
@@ -210,7 +213,8 @@ SETTINGS = np.dtype(
 
 WORK = np.dtype(
     [
-        ("half", "f8", (ERROR_SIZE, ERROR_SIZE)),
+        ("half", "f8", (ACCEL_BIAS, ERROR_SIZE)),
+        ("turned", "f8", (ERROR_SIZE, ACCEL_BIAS)),
         ("jacobian", "f8", (3, ERROR_SIZE)),
         ("innovation", "f8", (3,)),
         ("noise", "f8", (3, 3)),
@@ -255,7 +259,7 @@ def allocate(dtype: np.dtype, count: int = 1) -> np.ndarray:
     return memory if COMPILED else memory.view(np.recarray)
 
 
-_EVIDENCE = ("motion_stamp", "last_fix_stamp", "anchor_stamp")
+_EVIDENCE = ("still_stamp", "motion_stamp", "last_fix_stamp", "anchor_stamp")
 
 
 def blank_state() -> np.ndarray:

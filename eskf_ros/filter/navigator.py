@@ -37,6 +37,7 @@ from eskf_ros.filter.layout import (
     blank_state,
 )
 from eskf_ros.filter.output import write_odometry
+from eskf_ros.filter.recovery import judge_filter
 from eskf_ros.filter.strapdown import SECOND, between, propagate
 from eskf_ros.filter.timeline import (
     CHECKPOINT_SPACING,
@@ -154,9 +155,9 @@ def fuse(state, aids, i, settings, work):
         aid.verdict = DUPLICATE
         return
     if aid.stream == GNSS_POSITION:
-        note_position(state, aid)
+        note_position(state, aid, settings)
     elif aid.stream == GNSS_VELOCITY:
-        note_velocity(state, aid)
+        note_velocity(state, aid, settings)
     if state.level_known == 0 or (state.position_known == 0 and aid.stream != GNSS_POSITION):
         aid.verdict = BEFORE_ALIGNMENT
         return
@@ -167,11 +168,10 @@ def fuse(state, aids, i, settings, work):
         aid.innovation[k] = work.innovation[k]
     aid.dof = size
     aid.verdict, aid.nis = update(state, size, settings.gate[size], work)
-    if aid.verdict == FUSED:
-        if aid.stream == GNSS_POSITION:
-            note_absolute(state)
-        if state.heading_known == 0:
-            align_to_course(state, settings)
+    if aid.verdict == FUSED and state.heading_known == 0:
+        align_to_course(state, settings)
+    if aid.stream == GNSS_POSITION:
+        judge_filter(state, aid.verdict)
 
 
 @njit
@@ -180,14 +180,6 @@ def linearize(state, aid, settings, work):
     if aid.stream == GNSS_POSITION:
         return gnss_position.linearize(state, aid.payload, settings, work)
     return gnss_velocity.linearize(state, aid.payload, settings, work)
-
-
-@njit
-def note_absolute(state):
-    """Remember when an absolute aid was accepted and how long the wait for it was."""
-    if state.absolute_stamp != NEVER:
-        state.absolute_interval = state.stamp - state.absolute_stamp
-    state.absolute_stamp = state.stamp
 
 
 @njit
@@ -371,6 +363,11 @@ class Navigator:
     def window_needed(self) -> float:
         """The window (s) that would have kept every message so far; 0 when none was too late."""
         return float(self._timeline["furthest_late"][0]) / SECOND
+
+    @property
+    def restarts(self) -> int:
+        """How often the alignment started again: after a long silence of the IMU, or many rejected fixes in a row."""
+        return int(self._states["restarts"][0])
 
     @property
     def held_bytes(self) -> int:

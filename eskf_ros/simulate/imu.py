@@ -24,7 +24,7 @@ from eskf_ros.simulate.trajectory import DriveTrajectory, cross
 Array = NDArray[np.float64]
 
 GRADES: dict[str, dict[str, float]] = {
-    # Telephone and hobby sensors; also what the estimator assumes by default.
+    # Telephone and hobby sensors.
     "consumer": {
         "imu.gyro_noise_density": 2.0e-4,
         "imu.accel_noise_density": 2.0e-3,
