@@ -92,21 +92,24 @@ def transition_of_step(state: Any, samples: tuple[Any, Any, Any, Any], dt: float
 
 
 def applied_to_identity(state: Any, samples: tuple[Any, Any, Any, Any], dt: float, coupling: float = 1.0) -> Array:
-    """Apply the transition kernel to the identity, its arguments worked out here from what its docstring says."""
+    """Apply the transition kernel to the identity, its arguments worked out here from what its docstring says.
+
+    The six rows of the biases, which the kernel leaves out, are those of the identity.
+    """
     force_0, rate_0, force_1, rate_1 = (np.array(part) for part in samples)
     turn = 0.5 * dt * (0.5 * (rate_0 + rate_1) - state["gyro_bias"])
     middle = to_rotation(state["attitude"]) * Rotation.from_rotvec(turn)
     force = middle.apply(0.5 * (force_0 + force_1) - state["accel_bias"])
     gravity = np.array(gravity_map(state, tuples(state["position_map"])))
     strength = float(np.linalg.norm(gravity))
-    out = np.empty((15, 15))
+    moving = np.empty((9, 15))
     rows = tuple(tuple(float(value) for value in row) for row in middle.as_matrix())
     earth_rate = tuples(state["earth_rate_map"])
     up = tuples(-gravity / strength)
     kernel.apply_transition(
-        np.eye(15), out, rows, tuples(force), up, strength / SEMI_MAJOR_AXIS, earth_rate, dt, coupling
+        np.eye(15), moving, 15, rows, tuples(force), up, strength / SEMI_MAJOR_AXIS, earth_rate, dt, coupling
     )
-    return out
+    return np.vstack([moving, np.eye(15)[9:]])
 
 
 def tolerance(dt: float) -> Array:
