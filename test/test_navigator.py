@@ -288,3 +288,34 @@ def test_shapes_are_what_they_are_said_to_be(recording):
     assert navigator.take_records().dtype == RECORD
     assert np.array_equal(rows["pose_covariance"], rows["pose_covariance"].transpose(0, 2, 1))
     assert np.array_equal(rows["twist_covariance"], rows["twist_covariance"].transpose(0, 2, 1))
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (lambda force, rate: (force - [0.0, 0.0, 9.8], rate), "removes gravity"),
+        (lambda force, rate: (force / 9.80665, rate), "units of g"),
+        (lambda force, rate: (force * [1.0, -1.0, -1.0], rate * [1.0, -1.0, -1.0]), "North-East-Down"),
+        (lambda force, rate: (force[:, [2, 0, 1]], rate[:, [2, 0, 1]]), "mount_rpy_deg"),
+        (lambda force, rate: (force, np.degrees(rate)), "deg/s"),
+    ],
+)
+def test_a_stream_in_the_wrong_unit_or_axes_is_named(change, complaint):
+    drive = simulate("drive", seed=1, imu_rate=100.0)
+    navigator = Navigator(from_mapping(drive.parameters()))
+    force, rate = change(drive.specific_force, drive.angular_rate)
+    navigator.push_imu(drive.imu_stamp, force, rate)
+    assert [sentence for sentence in navigator.complaints if complaint in sentence]
+
+
+def test_a_good_stream_has_no_complaint(recording):
+    navigator, _ = run(recording)
+    assert navigator.complaints == []
+
+
+@pytest.mark.parametrize("offset", [18.0, -18.0])
+def test_clocks_that_differ_are_named_with_the_difference(recording, offset):
+    navigator, _ = run(recording, gnss_from=1e9)
+    offer_position(navigator, int(recording.imu_stamp[-1]) + round(offset * SECOND))
+    direction = "ahead of" if offset > 0.0 else "behind"
+    assert [sentence for sentence in navigator.complaints if f"18.0 s {direction}" in sentence]

@@ -14,6 +14,7 @@ from eskf_ros.earth import EARTH_RATE, STANDARD_GRAVITY, east_north_up_to_ecef, 
 from eskf_ros.filter.aiding.gnss_position import position_of_fix
 from eskf_ros.filter.covariance import transform_attitude_error
 from eskf_ros.filter.layout import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, NEVER, POSITION, VELOCITY
+from eskf_ros.filter.monitors import watch_input
 from eskf_ros.filter.strapdown import gravity_map
 from eskf_ros.rotation import (
     cross,
@@ -143,6 +144,7 @@ def watch_stillness(state, settings):
     if duration < settings.static_duration or state.window_count < MINIMUM_WINDOW_SAMPLES:
         return
     still = is_still(state, settings) and state.motion_stamp < state.window_start
+    watch_input(state, still, settings)
     if not still:
         state.still_count = 0
     else:

@@ -110,6 +110,13 @@ STATE = np.dtype(
         ("still_stamp", "i8"),
         ("still_count", "i8"),
         ("still_sum", "f8", (6,)),
+        # Monitors: windows seen, and those in which the IMU cannot be what it should be.
+        ("windows", "i8"),
+        ("odd_gravity_windows", "i8"),
+        ("odd_gravity", "f8"),
+        ("tilted_windows", "i8"),
+        ("tilted_force", "f8", (3,)),
+        ("fast_windows", "i8"),
         # When absolute aids were last accepted, how many were rejected since, and how often that ended in a restart.
         ("absolute_stamp", "i8"),
         ("absolute_interval", "i8"),

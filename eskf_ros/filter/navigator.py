@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -36,6 +37,7 @@ from eskf_ros.filter.layout import (
     allocate,
     blank_state,
 )
+from eskf_ros.filter.monitors import complaints
 from eskf_ros.filter.output import write_odometry
 from eskf_ros.filter.recovery import judge_filter
 from eskf_ros.filter.strapdown import SECOND, between, propagate
@@ -217,6 +219,9 @@ class Navigator:
         self._rows = allocate(ODOMETRY, len(self._imu))
         self._offered = allocate(AID)
         self._refused: list[np.ndarray] = []
+        self._offered_count: Counter[Stream] = Counter()
+        self._refused_count: Counter[Stream] = Counter()
+        self._stamp_difference: dict[Stream, float] = {}
 
     def push_imu(
         self,
@@ -370,11 +375,25 @@ class Navigator:
         return int(self._states["restarts"][0])
 
     @property
+    def complaints(self) -> list[str]:
+        """What is wrong with whole streams, one sentence each with what to do; empty when nothing is."""
+        found = complaints(self._states[0])
+        for stream, difference in self._stamp_difference.items():
+            if 2 * self._refused_count[stream] > self._offered_count[stream]:
+                found.append(
+                    f"the stamps of {stream.name.lower()} are {abs(difference):.1f} s "
+                    f"{'ahead of' if difference > 0.0 else 'behind'} the IMU's: synchronise the clocks, or set the "
+                    "time_offset of the stream"
+                )
+        return found
+
+    @property
     def held_bytes(self) -> int:
         """Memory of the history buffers: grows with window and rates, not with time."""
         return sum(buffer.nbytes for buffer in (self._imu, self._aids, self._checkpoints, self._rows))
 
     def _push_aid(self, stream: Stream, stamp: int, arrival: int, door: Verdict, payload: Sequence[float]) -> None:
+        self._offered_count[stream] += 1
         frontier = int(self._timeline["frontier"][0])
         early = frontier == NEVER and int(self._timeline["aid_count"][0]) >= EARLY_AIDS
         if stamp <= 0 or (frontier != NEVER and stamp > frontier + LARGEST_JUMP):
@@ -390,6 +409,10 @@ class Navigator:
 
     def _refuse(self, stream: Stream, stamp: int, arrival: int, verdict: Verdict) -> None:
         """Record a measurement that never enters the timeline."""
+        frontier = int(self._timeline["frontier"][0])
+        if frontier != NEVER:
+            self._refused_count[stream] += 1
+            self._stamp_difference[stream] = (stamp - frontier) / SECOND
         self._refused.append(np.array([(stamp, arrival, stream, verdict, 0, math.nan, (math.nan,) * 3)], RECORD))
 
     def _take_records(self, everything: bool) -> np.ndarray:

@@ -108,7 +108,12 @@ class Summary:
 
     def warnings(self, navigator: Navigator, topics: TopicNames, parameters: Parameters) -> list[str]:
         """What the user should know, one line each."""
-        lines = []
+        lines = navigator.complaints
+        if navigator.restarts:
+            lines.append(
+                f"the alignment started again {navigator.restarts} times: the IMU was silent for seconds, or fix after "
+                "fix contradicted the filter (IMU noise parameters too small, wrong mounting, lever arm or time offset)"
+            )
         names = {Stream.GNSS_POSITION: topics.gnss_fix, Stream.GNSS_VELOCITY: topics.gnss_velocity}
         late = {name: int(self._verdicts[stream, Verdict.OUTSIDE_HISTORY]) for stream, name in names.items()}
         late[topics.imu] = navigator.imu_counts["late"]
