@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from inertial_oracle import Inputs, MapState, integrate
-from kernels import make_settings, make_state, make_work, run_samples, to_rotation
+from kernels import make_settings, make_state, make_work, run_samples, to_rotation, tuples
 from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from eskf_ros.filter.strapdown import LONGEST_STEP, SECOND, gravity_map
+from eskf_ros.filter.strapdown import LONGEST_STEP, SECOND, gravity_map, step
 from eskf_ros.simulate.imu import ideal_samples
 from eskf_ros.simulate.map_frame import MapFrame
 from eskf_ros.simulate.scenario import DATUM, trajectory
@@ -86,6 +87,44 @@ def test_error_is_of_second_order_in_the_imu_interval() -> None:
     assert (ratios > 3.6).all(), (errors, ratios)
     assert (ratios < 4.4).all(), (errors, ratios)
     np.testing.assert_array_less(errors[-1], (0.02, 1e-3, 2e-5))
+
+
+def test_one_step_is_exact_for_linear_readings_to_the_fourth_order() -> None:
+    """Half the interval, a 32nd of the error: without the coning or the sculling terms it would be an eighth.
+
+    Force and rate are parallel at mid-interval: the rotation of the force to second order, omega x (omega x f), is
+    none of these terms.
+    """
+    rate, rate_slope = np.array([1.0, -2.0, 1.5]), np.array([-3.0, 1.0, 4.0])
+    force, force_slope = 5.0 * rate, np.array([20.0, 30.0, -10.0])
+    attitude = Rotation.from_euler("xyz", [0.3, -0.2, 2.0])
+
+    def derivative(t: float, y: Array) -> Array:
+        turn = Rotation.from_quat(y[3:7])
+        w = rate + t * rate_slope
+        x, scalar = y[3:6], y[6]
+        change = 0.5 * np.concatenate([scalar * w + np.cross(x, w), [-x @ w]])
+        return np.concatenate([turn.apply(force + t * force_slope) - (0.0, 0.0, 9.80665), change])
+
+    errors = []
+    for dt in (0.08, 0.04):
+        solution = solve_ivp(
+            derivative,
+            (-0.5 * dt, 0.5 * dt),
+            [*np.zeros(3), *attitude.as_quat()],
+            method="DOP853",
+            rtol=1e-13,
+            atol=1e-15,
+        )
+        # No datum: neither Earth rate nor a change of gravity, only the increments.
+        state = make_state(attitude=attitude, datum=None)
+        half_force, half_rate = 0.5 * dt * force_slope, 0.5 * dt * rate_slope
+        ends = (force - half_force, rate - half_rate, force + half_force, rate + half_rate)
+        step(state, *(tuples(end) for end in ends), dt, 0.0, SETTINGS, WORK)
+        turn = Rotation.from_quat(solution.y[3:7, -1]).inv() * to_rotation(state["attitude"])
+        errors.append((np.linalg.norm(state["velocity_map"] - solution.y[:3, -1]), turn.magnitude()))
+    ratios = np.array(errors[0]) / np.array(errors[1])
+    assert (ratios > 28.0).all(), (errors, ratios)
 
 
 def test_intervals_may_be_split_anywhere() -> None:
