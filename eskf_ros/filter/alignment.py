@@ -120,9 +120,10 @@ def restart(state):
 @njit
 def watch_stillness(state, settings):
     """Add the newest IMU sample to the stillness window; at the end of a window level if that is still wanted."""
-    if state.first_stamp == NEVER or state.imu_interval > settings.imu_gap:
-        # What a hole hides belongs to no window.
+    if state.first_stamp == NEVER:
         state.first_stamp = state.stamp
+    if state.imu_interval > settings.imu_gap:
+        # What a hole hides belongs to no window.
         state.window_start = NEVER
         state.still_count = 0
     if state.window_start == NEVER:

@@ -275,4 +275,6 @@ def blank_state() -> np.ndarray:
     for field in ("stamp", "imu_stamp", "first_stamp", "window_start", "absolute_stamp", *_EVIDENCE):
         state[field] = NEVER
     state["attitude"][0, 0] = 1.0
+    # Until two samples say better: it divides.
+    state["imu_interval"] = 0.01
     return state

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.aiding import gnss_position, gnss_velocity
@@ -38,7 +38,7 @@ from eskf_ros.filter.layout import (
     blank_state,
 )
 from eskf_ros.filter.monitors import complaints
-from eskf_ros.filter.output import write_odometry
+from eskf_ros.filter.output import status_of, write_odometry
 from eskf_ros.filter.recovery import judge_filter
 from eskf_ros.filter.strapdown import SECOND, between, propagate
 from eskf_ros.filter.timeline import (
@@ -347,7 +347,7 @@ class Navigator:
     @property
     def status(self) -> Status:
         """The rung of the start-up ladder at the newest IMU sample."""
-        return Status(int(self.odometry["status"][0]))
+        return Status(status_of(self._states[0], self._settings[0]))
 
     @property
     def datum(self) -> tuple[float, float, float] | None:
@@ -463,7 +463,7 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
     settings["imu_to_base"] = imu_to_base
     settings["imu_position_base"] = imu.mount_position
     settings["lever_arm_body"] = imu_to_base.T @ np.subtract(parameters.gnss.lever_arm, imu.mount_position)
-    settings["gate"][0, 1:] = chi2.ppf(parameters.gnss.gate_probability, [1, 2, 3])
+    settings["gate"][0, 1:] = chdtri([1, 2, 3], 1.0 - parameters.gnss.gate_probability)
     settings["static_duration"] = alignment.static_duration
     settings["moving_start_after"] = alignment.moving_start_after
     settings["still_gyro_std"] = alignment.still_gyro_std
