@@ -485,10 +485,9 @@ def test_ctrl_c_leaves_nothing_half_done(tmp_path: Path, earlier: bool) -> None:
         folder.mkdir()
         (folder / "summary.json").write_text("of an earlier replay")
     command = [sys.executable, "-m", "eskf_ros.replay.main", str(BAG), "--config", str(CONFIG), "--out", str(tmp_path)]
-    environment = os.environ | {"PYTHONPATH": str(CHECKOUT), "NUMBA_DISABLE_JIT": "1"}
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-    ) as process:
+    environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=environment, cwd=CHECKOUT) as process:
         deadline = time.monotonic() + 60.0
         while not list(tmp_path.glob("*/.partial-*")) and time.monotonic() < deadline:
             time.sleep(0.02)

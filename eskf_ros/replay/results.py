@@ -84,7 +84,7 @@ class ResultFiles:
         self._aids.write(aids_lines(records))
         stamps, known = rows["stamp"], rows["position_known"]
         if datum is not None and known.any():
-            chosen = rows[known & _first_in_each(stamps, self._last_stamp, self._interval)]
+            chosen = selected(rows, known & _first_in_each(stamps, self._last_stamp, self._interval))
             numbers = np.column_stack([chosen["position_map"], chosen["attitude_body_to_map"][:, [1, 2, 3, 0]]])
             self._trajectory.write(tum_text(chosen["stamp"], numbers))
             self._bag.write(self._odometry, chosen["stamp"], odometry_messages(chosen), self._strings)
@@ -119,6 +119,11 @@ class ResultFiles:
         self._all.__exit__(kind, error, trace)
         if self._is_new and not any(self.folder.iterdir()):
             self.folder.rmdir()
+
+
+def selected(rows: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[Any]:
+    """`rows[mask]`, without a copy when it is all of them: a row is more than a kilobyte."""
+    return rows if mask.all() else rows[mask]
 
 
 def _first_in_each(stamps: NDArray[np.int64], last: int, interval: int) -> NDArray[np.bool_]:

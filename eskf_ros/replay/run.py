@@ -16,7 +16,7 @@ from eskf_ros.filter.layout import ODOMETRY
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.parameters import Parameters
 from eskf_ros.replay.feed import Feed
-from eskf_ros.replay.results import ResultFiles
+from eskf_ros.replay.results import ResultFiles, selected
 from eskf_ros.replay.summary import Summary, truth_result
 from eskf_ros.replay.topics import FIX, find_topics, truth_converter
 from eskf_ros.replay.truth import TruthComparison
@@ -84,7 +84,7 @@ def replay(
         with ResultFiles(options.folder, parameters.frames, options.output_rate if thinned else 0.0) as files:
 
             def collect(rows: NDArray[Any], records: NDArray[Any]) -> None:
-                known, datum = rows[rows["position_known"]], navigator.datum
+                known, datum = selected(rows, rows["position_known"]), navigator.datum
                 if len(known) and topics.truth and datum:
                     truth.add_rows(known, datum)
                 summary.add(known, records)

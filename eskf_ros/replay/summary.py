@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.filter.layout import ODOMETRY, STREAM_NAMES, Status, Stream, Verdict
+from eskf_ros.filter.layout import STREAM_NAMES, Status, Stream, Verdict
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.parameters import Parameters
 from eskf_ros.replay.feed import Feed
@@ -31,7 +31,7 @@ class Summary:
         self._feed = feed
         self._outages = outages
         self._distances = [0.0] * len(outages)
-        self._last_row = np.zeros(0, ODOMETRY)
+        self._last_position = np.zeros((0, 3))
         self._rows = 0
         self._verdicts = np.zeros((len(STREAM_NAMES), len(Verdict)), np.int64)
         self._nis_count = np.zeros(len(STREAM_NAMES), np.int64)
@@ -41,10 +41,10 @@ class Summary:
     def add(self, rows: NDArray[Any], records: NDArray[Any]) -> None:
         """Take ODOMETRY rows (n,) with known positions and increasing stamps, and final RECORD rows (m,)."""
         self._rows += len(rows)
-        self._last_row = np.concatenate([self._last_row, rows])
-        steps = np.linalg.norm(np.diff(self._last_row["position_map"], axis=0), axis=1)
-        seconds = self._seconds(self._last_row["stamp"][1:])
-        self._last_row = self._last_row[-1:].copy()
+        positions = np.concatenate([self._last_position, rows["position_map"]])
+        steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+        seconds = self._seconds(rows["stamp"][len(rows) - len(steps) :])
+        self._last_position = positions[-1:]
         for number, (start, length) in enumerate(self._outages):
             self._distances[number] += float(steps[(seconds > start) & (seconds <= start + length)].sum())
 
