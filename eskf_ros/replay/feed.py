@@ -89,7 +89,8 @@ class Feed:
                 self._navigator.push_gnss_velocity(*arguments)
         if imu is not None:
             push_imu_until(len(stamps))
-        return _joined_rows(rows)
+        # As bytes: numpy copies structured arrays field by field and takes ten times as long.
+        return np.frombuffer(b"".join(part.data for part in rows), ODOMETRY)
 
     def _in_outage(self, stamp: int) -> bool:
         if self.first_stamp is None:
@@ -131,16 +132,6 @@ class Feed:
             offers += _with_place(times, places, Stream.GNSS_VELOCITY, arguments)
         offers.sort(key=lambda item: item[0])
         return [offer for _, offer in offers]
-
-
-def _joined_rows(parts: list[NDArray[Any]]) -> NDArray[Any]:
-    """All rows in one array: np.concatenate takes 40 us for each structured array, as much as the filter itself."""
-    rows = np.empty(sum(map(len, parts)), ODOMETRY)
-    begin = 0
-    for part in parts:
-        rows[begin : begin + len(part)] = part
-        begin += len(part)
-    return rows
 
 
 def _listed(column: NDArray[Any]) -> list[Any]:

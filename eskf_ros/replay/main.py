@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any, NoReturn
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from rich.console import Console
     from rich.table import Table
 
     from eskf_ros.parameters import Parameters
@@ -199,8 +198,6 @@ def _folder(bag: Path, out: Path | None) -> Path:
 def _replay(bag: Path, folder: Path, parameters: Parameters, options: argparse.Namespace) -> dict[str, Any]:
     """Replay one recording and show the outcome; raises _Mistake."""
     started = time.perf_counter()
-    from rich.console import Console
-
     from eskf_ros.bags import BagError
     from eskf_ros.replay.run import Options, replay
     from eskf_ros.replay.topics import InputError
@@ -214,7 +211,7 @@ def _replay(bag: Path, folder: Path, parameters: Parameters, options: argparse.N
     except OSError as error:
         raise _Mistake(f"{error.filename or folder}: {error.strerror or error}") from error
     if not options.quiet:
-        _show(Console(stderr=options.json == "-"), summary, folder)
+        _show(summary, folder, to_stderr=options.json == "-")
     for warning in summary["warnings"]:
         _say(f"warning: {warning}")
     return summary
@@ -247,8 +244,11 @@ def _write_json(target: str, content: Any) -> None:
         raise _Mistake(f"--json {target}: {error.strerror or error}") from error
 
 
-def _show(console: Console, summary: dict[str, Any], folder: Path) -> None:
+def _show(summary: dict[str, Any], folder: Path, to_stderr: bool) -> None:
     """Print the tables."""
+    from rich.console import Console
+
+    console = Console(stderr=to_stderr)
     duration, imu_count = summary["duration_s"], summary["imu_count"]
     rate = (imu_count - 1) / duration if duration > 0.0 else 0.0
     console.print(

@@ -53,7 +53,7 @@ class ResultFiles:
         self._files = ExitStack()
 
     def __enter__(self) -> ResultFiles:
-        self._is_new = not self.folder.exists()
+        self._created = [place for place in (self.folder, *self.folder.parents) if not place.exists()]
         self.folder.mkdir(parents=True, exist_ok=True)
         try:
             # A folder, not other names: odometry.mcap holds its own name.
@@ -117,8 +117,9 @@ class ResultFiles:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._all.__exit__(kind, error, trace)
-        if self._is_new and not any(self.folder.iterdir()):
-            self.folder.rmdir()
+        for place in self._created:
+            if not any(place.iterdir()):
+                place.rmdir()
 
 
 def selected(rows: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[Any]:

@@ -1,4 +1,20 @@
-"""summary.json: what a replay found out, in numbers that are not rounded."""
+"""summary.json: what a replay found out, in numbers that are not rounded.
+
+Stamps are integer ns, lengths m, times s; what is not known is null.
+
+- `duration_s`: from the first to the newest IMU stamp; `imu_count`: samples offered; `imu`: what became of them.
+- `aids.{name}`: `offered` measurements by their final verdict: `fused`, `late` (outside_history), `rejected` (all other
+  verdicts but waiting, which is for those newer than the last IMU sample); all of them in `verdicts`. `withheld` were
+  not offered (--outage, --mode ins-only). `nis_mean` and `nis_in_95` are over all measurements that were tested, the
+  gated ones included.
+- `..._in_95`, `in_95`: share of the values not above the 95 % quantile of chi-square (ideal 0.95, cautious above).
+- `final`: the state at the newest IMU sample, `position` and `velocity` of base_link in map, `lla` deg deg m, `rpy_deg`
+  about the local vertical, yaw 0 = east; biases in IMU axes.
+- `error`: absolute errors at the truth epochs from the first known position on, heading from the first known heading
+  on; of the antenna when the truth is a NavSatFix. `nees`: e' P^-1 e, 3 degrees of freedom, so its ideal mean is 3.
+- `outages[]`: `distance` is the length of the estimated path; the errors are those at the last truth epoch within.
+- `timing`: `write` is the work of a thread beside the others, of which `wait` was waited for.
+"""
 
 from __future__ import annotations
 
