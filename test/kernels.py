@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from eskf_ros.compiled import njit
 from eskf_ros.filter import layout, strapdown
 from eskf_ros.filter.alignment import set_datum
-from eskf_ros.filter.navigator import settings_from
+from eskf_ros.filter.layout import NEVER
+from eskf_ros.filter.navigator import settings_from, take_sample
 from eskf_ros.parameters import from_mapping
 
 Array = NDArray[np.float64]
@@ -140,20 +141,26 @@ def tuples(vector: Any) -> tuple[float, ...]:
     return tuple(float(value) for value in vector)
 
 
+def run_samples(
+    state: Any, stamps: Any, force: Any, rate: Any, settings: Any, work: Any, cuts: NDArray[np.int64] | None = None
+) -> None:
+    """Propagate ``state``, which stands at the first sample, through all the others, cut at the stamps ``cuts``."""
+    samples = layout.allocate(layout.IMU, len(stamps))
+    samples["stamp"], samples["specific_force"], samples["angular_rate"] = stamps, force, rate
+    _run_samples(state, samples, np.zeros(0, np.int64) if cuts is None else cuts, settings, work)
+
+
 @njit
-def run_samples(state, stamps, force, rate, settings, work):
-    """Propagate ``state``, which stands at the first sample, through all the others."""
-    for i in range(3):
-        state.specific_force[i] = force[0, i]
-        state.angular_rate[i] = rate[0, i]
-    state.stamp = stamps[0]
-    for k in range(1, len(stamps)):
-        strapdown.propagate(
-            state,
-            stamps[k],
-            (force[k, 0], force[k, 1], force[k, 2]),
-            (rate[k, 0], rate[k, 1], rate[k, 2]),
-            stamps[k] - stamps[k - 1],
-            settings,
-            work,
-        )
+def _run_samples(state, samples, cuts, settings, work):
+    state.imu_stamp = NEVER
+    state.imu_interval = 1e9
+    take_sample(state, samples[0])
+    cut = 0
+    for k in range(1, len(samples)):
+        sample = samples[k]
+        while cut < len(cuts) and cuts[cut] < sample.stamp:
+            if cuts[cut] > state.stamp:
+                strapdown.propagate(state, cuts[cut], sample, settings, work)
+            cut += 1
+        strapdown.propagate(state, sample.stamp, sample, settings, work)
+        take_sample(state, sample)

@@ -137,7 +137,6 @@ def test_twist_covariance_of_a_turned_imu(seed: int) -> None:
 
 
 @seeds
-@pytest.mark.xfail(strict=True, reason="write_twist_covariance crosses theta with base_link's velocity, not the IMU's")
 def test_twist_covariance_of_an_imu_off_the_origin(seed: int) -> None:
     """omega x offset is known in body axes whatever the attitude: the error is R' (dv + v_imu x theta)."""
     state = running(seed)

@@ -39,10 +39,17 @@ def samples_of(inputs: Inputs, stamps: NDArray[np.int64]) -> tuple[Array, Array]
     return np.array([reading[0] for reading in readings]), np.array([reading[1] for reading in readings])
 
 
-def navigate(start: tuple[Any, Any, Rotation], datum: Any, stamps: NDArray[np.int64], force: Array, rate: Array) -> Any:
-    """Return the state after all samples."""
+def navigate(
+    start: tuple[Any, Any, Rotation],
+    datum: Any,
+    stamps: NDArray[np.int64],
+    force: Array,
+    rate: Array,
+    cuts: NDArray[np.int64] | None = None,
+) -> Any:
+    """Return the state after all samples, the intervals between them cut at ``cuts``."""
     state = make_state(start[0], start[1], start[2], datum)
-    run_samples(state, stamps, force, rate, SETTINGS, WORK)
+    run_samples(state, stamps, force, rate, SETTINGS, WORK, cuts)
     return state
 
 
@@ -77,16 +84,19 @@ def stamps_at(rate_hz: int, seconds: float) -> NDArray[np.int64]:
 
 
 def test_error_is_of_second_order_in_the_imu_interval() -> None:
-    """Half the interval, a quarter of the error, in position, velocity and attitude alike."""
+    """Half the interval, at most a quarter of the error, in position, velocity and attitude alike.
+
+    The line of equal mean even gives the third order; straight lines from sample to sample give exactly the second,
+    and a hundred times the error at 400 Hz.
+    """
     errors = []
     for rate_hz in (50, 100, 200, 400):
         stamps = stamps_at(rate_hz, SHAKING_SECONDS)
         state = navigate(SHAKING_START, SHAKING_DATUM, stamps, *samples_of(shaking, stamps))
         errors.append(departures(state, shaking_truth()))
     ratios = np.array(errors[:-1]) / np.array(errors[1:])
-    assert (ratios > 3.6).all(), (errors, ratios)
-    assert (ratios < 4.4).all(), (errors, ratios)
-    np.testing.assert_array_less(errors[-1], (0.02, 1e-3, 2e-5))
+    assert (ratios > 4.0).all(), (errors, ratios)
+    np.testing.assert_array_less(errors[-1], (2e-4, 1e-5, 2e-7))
 
 
 def test_one_step_is_exact_for_linear_readings_to_the_fourth_order() -> None:
@@ -128,26 +138,16 @@ def test_one_step_is_exact_for_linear_readings_to_the_fourth_order() -> None:
 
 
 def test_intervals_may_be_split_anywhere() -> None:
-    """Aids at stamps of their own cut intervals, the readings interpolated: the error keeps its order and its size."""
+    """Aids at stamps of their own cut intervals: the parts give the whole, to what a step itself leaves."""
     rng = np.random.default_rng(2)
-    differences, errors = [], []
     for rate_hz in (50, 100, 200):
         stamps = stamps_at(rate_hz, SHAKING_SECONDS)
         force, rate = samples_of(shaking, stamps)
-        plain = navigate(SHAKING_START, SHAKING_DATUM, stamps, force, rate)
-        cuts = np.unique(np.concatenate([stamps, rng.integers(0, stamps[-1], len(stamps)), stamps[1:50] - 1]))
-        cut_force, cut_rate = (
-            np.stack([np.interp(cuts, stamps, readings[:, axis]) for axis in range(3)], axis=-1)
-            for readings in (force, rate)
-        )
-        split = navigate(SHAKING_START, SHAKING_DATUM, cuts, cut_force, cut_rate)
-        assert split["stamp"] == plain["stamp"]
-        differences.append(float(np.linalg.norm(split["position_map"] - plain["position_map"])))
-        errors.append(departures(plain, shaking_truth())[0])
-    # Second order: what splitting changes shrinks with the square of the interval, and is no more than the error.
-    assert differences[0] / differences[1] > 3.0
-    assert differences[1] / differences[2] > 3.0
-    assert all(difference < error for difference, error in zip(differences, errors)), (differences, errors)
+        cuts = np.unique(np.concatenate([rng.integers(0, stamps[-1], len(stamps)), stamps[1:50] - 1]))
+        ends = [navigate(SHAKING_START, SHAKING_DATUM, stamps, force, rate, c) for c in (None, cuts)]
+        assert ends[0]["stamp"] == ends[1]["stamp"]
+        difference = np.linalg.norm(ends[1]["position_map"] - ends[0]["position_map"])
+        assert difference < 0.5 * departures(ends[0], shaking_truth())[0]
 
 
 def test_long_intervals_are_cut() -> None:
@@ -177,8 +177,9 @@ def test_far_from_the_datum_nothing_is_approximated(offset: tuple[float, float, 
         stamps = stamps_at(rate_hz, 10.0)
         errors.append(departures(navigate(start, SHAKING_DATUM, stamps, *samples_of(shaking, stamps)), truth))
     ratios = np.array(errors[0]) / np.array(errors[1])
-    assert (abs(ratios - 4.0) < 0.4).all(), (errors, ratios)
-    assert errors[1][0] < 2e-3
+    assert (ratios[1:] > 4.0).all(), (errors, ratios)
+    # Micrometres, most of them from the very first interval, which knows no earlier sample.
+    assert errors[1][0] < 1e-5
 
 
 def test_gravity_without_a_datum_points_down() -> None:
@@ -235,36 +236,21 @@ def ten_minutes() -> tuple[DriveInputs, tuple[Any, Any, Rotation], MapState]:
 
 
 @lru_cache
-def ten_minutes_error(rate_hz: int, true_means: bool) -> tuple[float, float, float]:
-    """Return the departures after ten minutes of ideal samples.
-
-    ``true_means``: of samples changed by a twelfth of their second difference, so that the straight line from one to
-    the next has the mean of the true signal, to fourth order. That takes the loss by sampling out of the figure.
-    """
+def ten_minutes_error(rate_hz: int) -> tuple[float, float, float]:
+    """Return the departures after ten minutes of ideal samples."""
     inputs, start, truth = ten_minutes()
     stamps = stamps_at(rate_hz, 600.0)
-    readings = np.hstack(ideal_samples(inputs.path, MapFrame(DATUM), stamps * 1e-9))
-    if true_means:
-        readings[1:-1] -= np.diff(readings, 2, axis=0) / 12.0
-    force, rate = (np.ascontiguousarray(part) for part in (readings[:, :3], readings[:, 3:]))
+    force, rate = ideal_samples(inputs.path, MapFrame(DATUM), stamps * 1e-9)
     return departures(navigate(start, DATUM, stamps, force, rate), truth)
 
 
 @pytest.mark.slow
 def test_ten_minutes_of_the_drive_are_of_second_order() -> None:
-    """Half the interval, a quarter of the error, nearly all of it from the signal being taken as linear."""
-    coarse, fine = ten_minutes_error(500, False), ten_minutes_error(1000, False)
-    assert 3.6 < coarse[0] / fine[0] < 4.4, (coarse, fine)
-    assert fine[0] < 0.012, fine
+    """Half the interval, at most a quarter of the error."""
+    assert ten_minutes_error(100)[0] / ten_minutes_error(200)[0] > 4.0
 
 
 @pytest.mark.slow
-def test_ten_minutes_of_the_drive_at_1_khz_with_true_means_are_within_a_millimetre() -> None:
-    """What the strapdown itself adds to the sampling, coning, sculling, Coriolis and gravity included, is 0.03 mm."""
-    assert ten_minutes_error(1000, True)[0] < 1e-4
-
-
-@pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="linear in between costs 11 mm: the coning of what the line leaves out")
 def test_ten_minutes_of_the_drive_at_1_khz_are_within_a_millimetre() -> None:
-    assert ten_minutes_error(1000, False)[0] < 1e-3
+    """Without the bend of the signal between samples it is 11 mm."""
+    assert ten_minutes_error(1000)[0] < 1e-3

@@ -95,7 +95,8 @@ def shortest_turn(a, b):
             axis = cross(a, (1.0, 0.0, 0.0))
         else:
             axis = cross(a, (0.0, 1.0, 0.0))
-        sine = math.sqrt(dot(axis, axis))
+        scale = math.pi / math.sqrt(dot(axis, axis))
+        return (axis[0] * scale, axis[1] * scale, axis[2] * scale)
     scale = math.atan2(sine, cosine) / sine
     return (axis[0] * scale, axis[1] * scale, axis[2] * scale)
 
@@ -280,7 +281,8 @@ def level(state, sums, count, interval, still, settings):
     set_gyro_bias(
         state, (sums[3] / count, sums[4] / count, sums[5] / count), rotation, up, count * interval, still, settings
     )
-    if state.level_known == 0 and not math.isnan(settings.initial_heading):
+    # The parameter is true of the start only, not of where a restart finds the robot.
+    if state.level_known == 0 and state.restarts == 0 and not math.isnan(settings.initial_heading):
         state.heading_known = 1
         set_heading(state, settings.initial_heading, settings.initial_heading_std, settings)
     state.level_known = 1

@@ -80,11 +80,15 @@ STATE = np.dtype(
         ("gyro_bias", "f8", (3,)),
         # Covariance of the error state; the attitude error is a small rotation on the map side.
         ("covariance", "f8", (ERROR_SIZE, ERROR_SIZE)),
-        # Raw IMU reading at ``stamp``; stamp of the last IMU sample and the interval (s) it ended.
+        # Raw IMU reading at ``stamp``; the last IMU sample, its stamp and the interval (s) it ended; the one before.
         ("specific_force", "f8", (3,)),
         ("angular_rate", "f8", (3,)),
         ("imu_stamp", "i8"),
         ("imu_interval", "f8"),
+        ("imu_force", "f8", (3,)),
+        ("imu_rate", "f8", (3,)),
+        ("earlier_force", "f8", (3,)),
+        ("earlier_rate", "f8", (3,)),
         # Local frame, valid once datum_known.
         ("datum", "f8", (3,)),
         ("origin_ecef", "f8", (3,)),
@@ -275,6 +279,6 @@ def blank_state() -> np.ndarray:
     for field in ("stamp", "imu_stamp", "first_stamp", "window_start", "absolute_stamp", *_EVIDENCE):
         state[field] = NEVER
     state["attitude"][0, 0] = 1.0
-    # Until two samples say better: it divides.
-    state["imu_interval"] = 0.01
+    # Until there are two samples: longer than any gap, so that the first interval takes no bend from an earlier one.
+    state["imu_interval"] = 1e9
     return state

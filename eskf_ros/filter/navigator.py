@@ -40,7 +40,7 @@ from eskf_ros.filter.layout import (
 from eskf_ros.filter.monitors import complaints
 from eskf_ros.filter.output import status_of, write_odometry
 from eskf_ros.filter.recovery import judge_filter
-from eskf_ros.filter.strapdown import SECOND, between, propagate
+from eskf_ros.filter.strapdown import SECOND, propagate
 from eskf_ros.filter.timeline import (
     CHECKPOINT_SPACING,
     LARGEST_JUMP,
@@ -118,15 +118,7 @@ def predict(state, stamp, sample, settings, work):
     if sample.stamp - state.imu_stamp > LONGEST_GAP:
         restart(state)
         return
-    force = (sample.specific_force[0], sample.specific_force[1], sample.specific_force[2])
-    rate = (sample.angular_rate[0], sample.angular_rate[1], sample.angular_rate[2])
-    if stamp != sample.stamp:
-        fraction = (stamp - state.stamp) / (sample.stamp - state.stamp)
-        last_force = (state.specific_force[0], state.specific_force[1], state.specific_force[2])
-        last_rate = (state.angular_rate[0], state.angular_rate[1], state.angular_rate[2])
-        force = between(last_force, force, fraction)
-        rate = between(last_rate, rate, fraction)
-    propagate(state, stamp, force, rate, sample.stamp - state.imu_stamp, settings, work)
+    propagate(state, stamp, sample, settings, work)
 
 
 @njit
@@ -138,6 +130,10 @@ def take_sample(state, sample):
     state.stamp = sample.stamp
     state.imu_next += 1
     for i in range(3):
+        state.earlier_force[i] = state.imu_force[i]
+        state.earlier_rate[i] = state.imu_rate[i]
+        state.imu_force[i] = sample.specific_force[i]
+        state.imu_rate[i] = sample.angular_rate[i]
         state.specific_force[i] = sample.specific_force[i]
         state.angular_rate[i] = sample.angular_rate[i]
 

@@ -63,7 +63,7 @@ def write_odometry(state, settings, row):
     """Fill one ODOMETRY row from the state.
 
     The pose error of base_link is that of the IMU plus [R m]x theta, m the IMU's place in base_link; the twist error
-    in base_link axes is R' (dv + v x theta) (first order; Sola, section 4.4).
+    in base_link axes is R' (dv + v x theta), v the velocity of the IMU (first order; Sola, section 4.4).
     """
     covariance = state.covariance
     base_to_map = attitude_base_to_map(state, settings)
@@ -91,7 +91,7 @@ def write_odometry(state, settings, row):
         row.accel_bias_std[i] = math.sqrt(covariance[ACCEL_BIAS + i, ACCEL_BIAS + i])
         row.gyro_bias_std[i] = math.sqrt(covariance[GYRO_BIAS + i, GYRO_BIAS + i])
     write_pose_covariance(covariance, imu_offset, row)
-    write_twist_covariance(state, velocity, base_to_map, settings, row)
+    write_twist_covariance(state, base_to_map, settings, row)
 
 
 @njit
@@ -129,9 +129,11 @@ def write_pose_covariance(covariance, imu_offset, row):
 
 
 @njit
-def write_twist_covariance(state, velocity, base_to_map, settings, row):
+def write_twist_covariance(state, base_to_map, settings, row):
     """Write velocity covariance in map axes, and the 6x6 covariance of the twist in base_link axes."""
     covariance = state.covariance
+    # The sway of the mounting offset is known in body axes: an attitude error turns only the velocity of the IMU.
+    velocity = (state.velocity_map[0], state.velocity_map[1], state.velocity_map[2])
     # What the rate error times the mounting offset adds to the velocity is left out: millimetres per second.
     rate_variance = settings.gyro_noise_density**2 / state.imu_interval
     for i in range(3):

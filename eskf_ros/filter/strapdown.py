@@ -5,8 +5,8 @@
     d/dt R        = R [omega]x - [Omega]x R
 
 with Omega the Earth rate and g the normal gravity (both in map axes), f and omega the specific force and inertial
-rate in body axes. IMU samples are instantaneous values, linear in between (two-sample increments; Savage, Strapdown
-Analytics, ch. 7; Groves, sections 5.5 and 5.6).
+rate in body axes. IMU samples are instantaneous values; increments come from straight lines between them (two-sample
+coning and sculling; Savage, Strapdown Analytics, ch. 7; Groves, sections 5.5 and 5.6).
 """
 
 from __future__ import annotations
@@ -49,18 +49,19 @@ def increments(force_0, rate_0, force_1, rate_1, dt):
     sculling_b = cross(force_0, rate_1)
     h = 0.5 * dt
     k = dt * dt / 12.0
-    return (
-        (
-            h * (rate_0[0] + rate_1[0]) + k * coning[0],
-            h * (rate_0[1] + rate_1[1]) + k * coning[1],
-            h * (rate_0[2] + rate_1[2]) + k * coning[2],
-        ),
-        (
-            h * (force_0[0] + force_1[0]) + k * (sculling_a[0] + sculling_b[0]),
-            h * (force_0[1] + force_1[1]) + k * (sculling_a[1] + sculling_b[1]),
-            h * (force_0[2] + force_1[2]) + k * (sculling_a[2] + sculling_b[2]),
-        ),
+    angle = (
+        h * (rate_0[0] + rate_1[0]) + k * coning[0],
+        h * (rate_0[1] + rate_1[1]) + k * coning[1],
+        h * (rate_0[2] + rate_1[2]) + k * coning[2],
     )
+    velocity = (
+        h * (force_0[0] + force_1[0]) + k * (sculling_a[0] + sculling_b[0]),
+        h * (force_0[1] + force_1[1]) + k * (sculling_a[1] + sculling_b[1]),
+        h * (force_0[2] + force_1[2]) + k * (sculling_a[2] + sculling_b[2]),
+    )
+    # To second order in the rotation: the mean over the interval of (rotation from the middle)^2 / 2.
+    bent = cross(angle, cross(angle, velocity))
+    return angle, (velocity[0] + bent[0] / 24.0, velocity[1] + bent[1] / 24.0, velocity[2] + bent[2] / 24.0)
 
 
 @njit
@@ -132,33 +133,52 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
 
 
 @njit
-def propagate(state, stamp, force_1, rate_1, sample_interval, settings, work):
-    """Advance the state to ``stamp`` (ns), where the IMU reads ``force_1``, ``rate_1`` (raw, IMU axes).
+def propagate(state, stamp, sample, settings, work):
+    """Advance the state to ``stamp`` (ns), at or before ``sample``, the IMU sample that comes next.
 
-    Between its last reading and this one the IMU is linear. A long interval is cut into steps. ``sample_interval``
-    (ns) is the one between the two IMU samples around: longer than the gap of the settings, it may hide motion and
-    costs extra uncertainty.
+    Between two samples the IMU is the straight line whose mean is that of the parabola through them and the sample
+    before (Adams-Moulton): cut anywhere, the parts give the whole. A long interval is integrated in steps; one longer
+    than the gap of the settings may hide motion and costs extra uncertainty.
     """
-    interval = stamp - state.stamp
-    steps = (interval + LONGEST_STEP - 1) // LONGEST_STEP
-    f0 = (state.specific_force[0], state.specific_force[1], state.specific_force[2])
-    w0 = (state.angular_rate[0], state.angular_rate[1], state.angular_rate[2])
-    force_a = f0
-    rate_a = w0
-    seconds = interval / SECOND
-    gap = sample_interval / SECOND
-    if gap <= settings.imu_gap:
-        gap = 0.0
+    interval = (sample.stamp - state.imu_stamp) / SECOND
+    force_0, force_1 = line(state.earlier_force, state.imu_force, sample.specific_force, interval, state, settings)
+    rate_0, rate_1 = line(state.earlier_rate, state.imu_rate, sample.angular_rate, interval, state, settings)
+    gap = interval if interval > settings.imu_gap else 0.0
+    steps = (stamp - state.stamp + LONGEST_STEP - 1) // LONGEST_STEP
+    begin = (state.stamp - state.imu_stamp) / SECOND / interval
+    end = (stamp - state.imu_stamp) / SECOND / interval
+    force_a = between(force_0, force_1, begin)
+    rate_a = between(rate_0, rate_1, begin)
     for k in range(steps):
-        force_b = between(f0, force_1, (k + 1) / steps)
-        rate_b = between(w0, rate_1, (k + 1) / steps)
-        step(state, force_a, rate_a, force_b, rate_b, seconds / steps, gap, settings, work)
+        fraction = begin + (end - begin) * (k + 1) / steps
+        force_b = between(force_0, force_1, fraction)
+        rate_b = between(rate_0, rate_1, fraction)
+        step(state, force_a, rate_a, force_b, rate_b, (end - begin) * interval / steps, gap, settings, work)
         force_a = force_b
         rate_a = rate_b
+    force = between(state.imu_force, sample.specific_force, end)
+    rate = between(state.imu_rate, sample.angular_rate, end)
     for i in range(3):
-        state.specific_force[i] = force_1[i]
-        state.angular_rate[i] = rate_1[i]
+        state.specific_force[i] = force[i]
+        state.angular_rate[i] = rate[i]
     state.stamp = stamp
+
+
+@njit
+def line(earlier, last, following, interval, state, settings):
+    """Return the ends of the straight line that stands for the IMU between two samples (see ``propagate``)."""
+    bend = 0.0
+    if interval <= settings.imu_gap and 0.0 < state.imu_interval <= settings.imu_gap:
+        bend = interval * interval / (6.0 * (interval + state.imu_interval))
+    shift = (
+        bend * ((following[0] - last[0]) / interval - (last[0] - earlier[0]) / state.imu_interval),
+        bend * ((following[1] - last[1]) / interval - (last[1] - earlier[1]) / state.imu_interval),
+        bend * ((following[2] - last[2]) / interval - (last[2] - earlier[2]) / state.imu_interval),
+    )
+    return (
+        (last[0] - shift[0], last[1] - shift[1], last[2] - shift[2]),
+        (following[0] - shift[0], following[1] - shift[1], following[2] - shift[2]),
+    )
 
 
 @njit
