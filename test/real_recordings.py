@@ -35,6 +35,8 @@ from __future__ import annotations
 
 import calendar
 import datetime
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,6 +45,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.bags import BagWriter, message_dtype
+from eskf_ros.replay.main import main
 from eskf_ros.simulate.map_frame import MapFrame, to_geodetic
 
 Array = NDArray[np.float64]
@@ -69,48 +72,55 @@ DRIVE_TIME_OFFSET = 0.13
 DRIVE_VELOCITY_AGE = 0.13
 DRIVE_VELOCITY_STD = (0.05, 0.05, 0.1)
 
-KITTI_PARAMETERS = f"""\
+# What a user has to say about a car: where the sensors are and how their clocks differ.
+KITTI_INSTALLATION = f"""\
 /**:
   ros__parameters:
-    imu:
-      gyro_noise_density: 2.0e-4
-      accel_noise_density: 0.03
-      gyro_bias_random_walk: 3.0e-6
-      accel_bias_random_walk: 1.7e-4
-      # What a turn of a car hides in a hole of 1.6 s.
-      gap_gyro_std: 0.1
-      gap_accel_std: 1.0
-    gnss:
-      time_offset: {KITTI_TIME_OFFSET}
+    gnss.time_offset: {KITTI_TIME_OFFSET}
 """
 
-DRIVE_PARAMETERS = f"""\
+KITTI_NOISE = """\
+    imu.gyro_noise_density: 2.0e-4
+    imu.gyro_bias_random_walk: 3.0e-6
+    imu.accel_bias_random_walk: 1.7e-4
+    # What a turn of a car hides in a hole of 1.6 s.
+    imu.gap_gyro_std: 0.1
+    imu.gap_accel_std: 1.0
+"""
+
+DRIVE_INSTALLATION = f"""\
 /**:
   ros__parameters:
-    imu:
-      mount_position: [0.0, 0.0, 0.65]
-      mount_rpy_deg: [0.0, -6.8, 174.9]
-      # Vibration of roof and engine.
-      gyro_noise_density: 3.5e-3
-      accel_noise_density: 0.03
-      gyro_bias_random_walk: 1.0e-5
-      accel_bias_random_walk: 3.0e-4
-    gnss:
-      lever_arm: [0.0, 0.05, 0.65]
-      time_offset: {DRIVE_TIME_OFFSET}
-      position_std_floor: 0.01
-    alignment:
-      still_gyro_std: 0.06
+    imu.mount_position: [0.0, 0.0, 0.65]
+    imu.mount_rpy_deg: [0.0, -6.8, 174.9]
+    gnss.lever_arm: [0.0, 0.05, 0.65]
+    gnss.time_offset: {DRIVE_TIME_OFFSET}
 """
+
+DRIVE_NOISE = """\
+    # Vibration of roof and engine.
+    imu.gyro_noise_density: 3.5e-3
+    imu.accel_bias_random_walk: 3.0e-4
+    gnss.position_std_floor: 0.01
+"""
+
+OUTAGE_LENGTH = 15.0
+OUTAGE_SETS = tuple(
+    tuple(np.arange(first, 548.6 - 30.0 - OUTAGE_LENGTH, 45.0).tolist()) for first in (40.0, 55.0, 70.0)
+)
+"""Starts (s) of the outages of drive_0708: every 45 s, with 30 s of fixes between them, in three staggered replays."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """What `eskf_replay` needs: the bag, the parameter file, and the truth topic with the positions kept back."""
+    """What `eskf_replay` needs: the bag with the topic `truth`, and a parameter file.
+
+    `default_config` leaves the noise of the IMU at its defaults and says only how the sensors are installed.
+    """
 
     bag: Path
     config: Path
-    truth: str = "truth"
+    default_config: Path
 
 
 @dataclass(frozen=True)
@@ -174,7 +184,7 @@ def kitti_recording(folder: Path, with_velocity: bool) -> Recording:
     )
     return _write(
         folder / ("kitti_velocity" if with_velocity else "kitti"),
-        KITTI_PARAMETERS,
+        (KITTI_INSTALLATION, KITTI_NOISE),
         ImuSamples(time, specific_force, angular_rate),
         fixes[given],
         velocities if with_velocity else None,
@@ -229,7 +239,7 @@ def drive_0708_recording(folder: Path, source: Path, with_velocity: bool) -> Rec
     )
     return _write(
         folder / ("drive_0708_velocity" if with_velocity else "drive_0708"),
-        DRIVE_PARAMETERS,
+        (DRIVE_INSTALLATION, DRIVE_NOISE),
         ImuSamples(time, table[:, 1:4], table[:, 4:7]),
         fixes[given],
         velocities if with_velocity else None,
@@ -251,19 +261,41 @@ def _read_rtklib(path: Path) -> tuple[Array, Array]:
     return np.array(times), np.array(rows)
 
 
+def replayed(bag: Path, config: Path, starts: Sequence[float] = ()) -> dict[str, Any]:
+    """summary.json of `eskf_replay`, with outages of `OUTAGE_LENGTH` from each of `starts` (s); results beside the bag.
+
+    Raises RuntimeError when the command fails.
+    """
+    outages = [f"--outage={start:g}:{OUTAGE_LENGTH:g}" for start in starts]
+    code = main([str(bag), f"--config={config}", "--truth=truth", "--quiet", *outages])
+    if code != 0:
+        raise RuntimeError(f"eskf_replay {bag} ended with {code}")
+    return json.loads((results_folder(bag) / "summary.json").read_text())  # type: ignore[no-any-return]
+
+
+def results_folder(bag: Path) -> Path:
+    """Where `eskf_replay` puts the results of `bag`."""
+    return bag.parent / f"{bag.stem}_eskf"
+
+
 def _write(
     stem: Path,
-    parameters: str,
+    parameters: tuple[str, str],
     imu: ImuSamples,
     fixes: Fixes,
     velocities: Velocities | None,
     truth: Fixes,
     time_offset: float,
 ) -> Recording:
-    """Write `stem`.mcap and `stem`.yaml. `time_offset` is that of the parameters: GNSS stamp + offset = IMU stamp."""
+    """Write `stem`.mcap and two parameter files: `parameters` is the installation, and what is added for the noise.
+
+    `time_offset` is that of the parameters: GNSS stamp + offset = IMU stamp.
+    """
     stem.parent.mkdir(parents=True, exist_ok=True)
-    bag, config = stem.parent / f"{stem.name}.mcap", stem.parent / f"{stem.name}.yaml"
-    config.write_text(parameters, encoding="utf-8")
+    bag, config, default_config = (stem.parent / f"{stem.name}{end}" for end in (".mcap", ".yaml", "_default.yaml"))
+    installation, noise = parameters
+    config.write_text(installation + noise, encoding="utf-8")
+    default_config.write_text(installation, encoding="utf-8")
     with BagWriter(bag) as writer:
 
         def write(topic: str, type_name: str, arrival: Array, messages: NDArray[Any]) -> None:
@@ -274,7 +306,7 @@ def _write(
         if velocities is not None:
             write("gps/vel", VELOCITY, velocities.arrival, _velocity_messages(velocities))
         write("truth", FIX, truth.time + time_offset, _fix_messages(truth, time_offset))
-    return Recording(bag, config)
+    return Recording(bag, config, default_config)
 
 
 def _nanoseconds(seconds: Array) -> NDArray[np.int64]:
