@@ -158,3 +158,9 @@ def left_jacobian(v):
         (a * z + b * x * y, 1.0 - b * (x * x + z * z), -a * x + b * y * z),
         (-a * y + b * x * z, a * x + b * y * z, 1.0 - b * (x * x + y * y)),
     )
+
+
+@njit
+def wrapped(angle):
+    """Return ``angle`` (rad) brought within half a turn of zero."""
+    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))

@@ -17,7 +17,7 @@ from kernels import (
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from eskf_ros.filter.layout import NEVER, ODOMETRY, Status, allocate
+from eskf_ros.filter.layout import LOCAL, NEVER, ODOMETRY, Status, allocate
 from eskf_ros.filter.output import status_of, write_odometry
 
 Array = NDArray[np.float64]
@@ -34,7 +34,7 @@ PERTURBATION = np.repeat([1e-2, 1e-2, 1e-5, 1e-2, 1e-4], 3)
 
 def published(state: Any, settings: Any) -> Any:
     row = allocate(ODOMETRY)[0]
-    write_odometry(state, settings, row)
+    write_odometry(state, allocate(LOCAL)[0], settings, row)
     return row
 
 

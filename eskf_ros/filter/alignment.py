@@ -25,6 +25,7 @@ from eskf_ros.rotation import (
     rotate,
     rotate_back,
     to_matrix,
+    wrapped,
 )
 
 START_POSITION_STD = 1000.0
@@ -114,6 +115,7 @@ def restart(state):
     state.still_stamp = NEVER
     state.still_count = 0
     for i in range(3):
+        state.jump_position[i] -= state.position_map[i]
         state.position_map[i] = 0.0
         state.velocity_map[i] = 0.0
 
@@ -244,6 +246,7 @@ def level(state, sums, count, interval, still, settings):
     strength = math.sqrt(dot(force, force))
     if strength < 0.5 * STANDARD_GRAVITY:
         return
+    heading = heading_of(state, settings)
     up = local_up(state)
     measured = rotate(to_matrix(state.attitude), (force[0] / strength, force[1] / strength, force[2] / strength))
     turn_attitude(state, shortest_turn(measured, up))
@@ -285,6 +288,7 @@ def level(state, sums, count, interval, still, settings):
     if state.level_known == 0 and state.restarts == 0 and not math.isnan(settings.initial_heading):
         state.heading_known = 1
         set_heading(state, settings.initial_heading, settings.initial_heading_std, settings)
+    state.jump_heading += wrapped(heading_of(state, settings) - heading)
     state.level_known = 1
 
 

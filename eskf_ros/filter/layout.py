@@ -95,6 +95,13 @@ STATE = np.dtype(
         ("map_to_ecef", "f8", (3, 3)),
         ("earth_rate_map", "f8", (3,)),
         ("datum_known", "i8"),
+        # Odometry without jumps: step over the last IMU interval, pose at its end, corrections since.
+        ("step_position", "f8", (3,)),
+        ("step_heading", "f8"),
+        ("sample_position", "f8", (3,)),
+        ("sample_heading", "f8"),
+        ("jump_position", "f8", (3,)),
+        ("jump_heading", "f8"),
         # Start-up.
         ("level_known", "i8"),
         ("position_known", "i8"),
@@ -222,6 +229,18 @@ SETTINGS = np.dtype(
 )
 """Parameters as the kernels use them: radians, body axes, gate thresholds by degrees of freedom."""
 
+LOCAL = np.dtype(
+    [
+        ("started", "i8"),
+        ("position", "f8", (3,)),
+        ("heading", "f8"),
+        ("position_variance", "f8"),
+        ("heading_variance", "f8"),
+    ],
+    align=True,
+)
+"""Pose of the IMU in `odom` (m, rad) and the variances it has gathered since the start (per axis)."""
+
 WORK = np.dtype(
     [
         ("half", "f8", (ACCEL_BIAS, ERROR_SIZE)),
@@ -247,6 +266,10 @@ ODOMETRY = np.dtype(
         ("heading_known", "?"),
         ("position_map", "f8", (3,)),
         ("attitude_body_to_map", "f8", (4,)),
+        ("position_odom", "f8", (3,)),
+        ("attitude_body_to_odom", "f8", (4,)),
+        ("local_position_variance", "f8"),
+        ("local_heading_variance", "f8"),
         ("velocity_map", "f8", (3,)),
         ("velocity_body", "f8", (3,)),
         ("angular_rate_body", "f8", (3,)),
@@ -260,7 +283,10 @@ ODOMETRY = np.dtype(
     ],
     align=True,
 )
-"""What is published for one IMU sample: pose and twist of base_link (here "body" is base_link), biases in IMU axes."""
+"""What is published for one IMU sample: pose and twist of base_link (here "body" is base_link), biases in IMU axes.
+
+``map`` pose: the best estimate. ``odom`` pose: without jumps (see ``local``).
+"""
 
 
 def allocate(dtype: np.dtype, count: int = 1) -> np.ndarray:

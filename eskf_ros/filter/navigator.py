@@ -14,6 +14,7 @@ from eskf_ros.compiled import njit
 from eskf_ros.filter.aiding import gnss_position, gnss_velocity
 from eskf_ros.filter.alignment import (
     align_to_course,
+    heading_of,
     note_position,
     note_velocity,
     restart,
@@ -21,9 +22,11 @@ from eskf_ros.filter.alignment import (
     start_position,
     watch_stillness,
 )
+from eskf_ros.filter.door import admit
 from eskf_ros.filter.layout import (
     AID,
     IMU,
+    LOCAL,
     NEVER,
     ODOMETRY,
     RECORD,
@@ -37,13 +40,13 @@ from eskf_ros.filter.layout import (
     allocate,
     blank_state,
 )
+from eskf_ros.filter.local import carry, measure_step, note_jump
 from eskf_ros.filter.monitors import complaints
 from eskf_ros.filter.output import status_of, write_odometry
 from eskf_ros.filter.recovery import judge_filter
 from eskf_ros.filter.strapdown import SECOND, propagate
 from eskf_ros.filter.timeline import (
     CHECKPOINT_SPACING,
-    LARGEST_JUMP,
     doubled,
     forget,
     insert_aid,
@@ -71,16 +74,22 @@ LONGEST_GAP = 5 * SECOND
 """The IMU was silent for longer (ns): nothing is left of attitude and velocity, start again."""
 
 IMU_BATCH = 1024
-EARLY_AIDS = 4096
+
+HIGHEST_ALTITUDE = 1e5
+HIGHEST_SPEED = 600.0
+"""What no receiver on a robot reports (m, m/s)."""
+
+NO_STAND_IN = (0.0, 0.0, 0.0)
+"""The covariance of a message is its own."""
 
 
 @njit
-def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, rows):
+def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, locals_, rows):
     """Run the filter over all that waits, in the total order; return how many rows were written.
 
     One row for every IMU sample that is new and first on the output grid.
     """
-    t, settings, work = timeline[0], settings_[0], work_[0]
+    t, settings, work, local = timeline[0], settings_[0], work_[0], locals_[0]
     rewind(states, checkpoints, t, blank)
     state = states[0]
     row_count = 0
@@ -95,18 +104,22 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, r
         previous_stamp = state.imu_stamp
         predict(state, sample.stamp, sample, settings, work)
         take_sample(state, sample)
+        measure_step(state, settings)
         watch_stillness(state, settings)
         save_checkpoint(states, checkpoints, t)
+
+        is_new = sample.stamp > t.published and state.level_known == 1
+        if is_new:
+            carry(local, state, settings)
 
         while state.aid_next < t.aid_count and aids[state.aid_next].stamp == sample.stamp:
             fuse(state, aids, state.aid_next, settings, work)
             state.aid_next += 1
 
-        if sample.stamp > t.published:
-            t.published = sample.stamp
-            if state.level_known == 1 and is_on_grid(previous_stamp, sample.stamp, settings.output_interval):
-                write_odometry(state, settings, rows[row_count])
-                row_count += 1
+        if is_new and is_on_grid(previous_stamp, sample.stamp, settings.output_interval):
+            write_odometry(state, local, settings, rows[row_count])
+            row_count += 1
+        t.published = max(t.published, sample.stamp)
     return row_count
 
 
@@ -159,6 +172,8 @@ def fuse(state, aids, i, settings, work):
     if state.level_known == 0 or (state.position_known == 0 and aid.stream != GNSS_POSITION):
         aid.verdict = BEFORE_ALIGNMENT
         return
+    position = (state.position_map[0], state.position_map[1], state.position_map[2])
+    heading = heading_of(state, settings)
     if state.position_known == 0:
         start_position(state, aid.payload)
     size = linearize(state, aid, settings, work)
@@ -170,6 +185,7 @@ def fuse(state, aids, i, settings, work):
         align_to_course(state, settings)
     if aid.stream == GNSS_POSITION:
         judge_filter(state, aid.verdict)
+    note_jump(state, position, heading, settings)
 
 
 @njit
@@ -212,12 +228,14 @@ class Navigator:
         self._aids = allocate(AID, 256)
         self._checkpoints = allocate(STATE, 256)
         self._work = allocate(WORK)
+        self._local = allocate(LOCAL)
         self._rows = allocate(ODOMETRY, len(self._imu))
         self._offered = allocate(AID)
         self._refused: list[np.ndarray] = []
         self._offered_count: Counter[Stream] = Counter()
         self._refused_count: Counter[Stream] = Counter()
         self._stamp_difference: dict[Stream, float] = {}
+        self._stand_ins = 0
 
     def push_imu(
         self,
@@ -254,9 +272,10 @@ class Navigator:
             self._blank,
             self._settings,
             self._work,
+            self._local,
             self._rows,
         )
-        return np.array(self._rows[:count], ODOMETRY)
+        return _copied(self._rows, count)
 
     def push_gnss_position(
         self,
@@ -275,25 +294,23 @@ class Navigator:
         ``gnss.status_std_horizontal`` and ``_vertical``.
         """
         gnss = self.parameters.gnss
-        values = (latitude_deg, longitude_deg, altitude)
-        six = _upper_triangle(covariance)
-        if status >= 0 and (covariance_type == 0 or not any(six)):
-            horizontal = gnss.status_std_horizontal[min(status, 2)] ** 2
-            vertical = gnss.status_std_vertical[min(status, 2)] ** 2
-            six = (horizontal, 0.0, 0.0, horizontal, 0.0, vertical)
-        six, trusted = _conditioned(six, gnss.covariance_scale, gnss.position_std_floor)
+        matrix = np.ascontiguousarray(covariance, np.float64)
+        stand_in = NO_STAND_IN
+        if covariance_type == 0 or not matrix.any():
+            level = min(max(status, 0), 2)
+            horizontal, vertical = gnss.status_std_horizontal[level] ** 2, gnss.status_std_vertical[level] ** 2
+            stand_in = (horizontal, horizontal, vertical)
+        values = (math.radians(latitude_deg), math.radians(longitude_deg), float(altitude))
+        aid = self._admit(values, matrix, stand_in, gnss.covariance_scale, gnss.position_std_floor)
         if not gnss.use_position:
-            door = Verdict.DISABLED
+            aid["door"] = Verdict.DISABLED
         elif status < 0:
-            door = Verdict.NO_FIX
-        elif not all(map(math.isfinite, values)):
-            door = Verdict.NON_FINITE
-        elif abs(latitude_deg) > 90.0 or abs(longitude_deg) > 360.0 or abs(altitude) > 1e5:
-            door = Verdict.BAD_VALUE
-        else:
-            door = trusted
-        payload = (math.radians(latitude_deg), math.radians(longitude_deg), altitude, *six)
-        self._push_aid(Stream.GNSS_POSITION, stamp + self._gnss_offset, arrival, door, payload)
+            aid["door"] = Verdict.NO_FIX
+        elif aid["door"] == Verdict.WAITING and (
+            abs(latitude_deg) > 90.0 or abs(longitude_deg) > 360.0 or abs(altitude) > HIGHEST_ALTITUDE
+        ):
+            aid["door"] = Verdict.BAD_VALUE
+        self._push_aid(Stream.GNSS_POSITION, stamp + self._gnss_offset, arrival)
 
     def push_gnss_velocity(
         self, stamp: int, velocity_enu: Sequence[float], covariance: Sequence[float] | FloatArray, arrival: int = 0
@@ -303,21 +320,17 @@ class Navigator:
         An all-zero or absent covariance (first number negative) becomes ``gnss.unknown_velocity_std``.
         """
         gnss = self.parameters.gnss
-        values = tuple(float(value) for value in velocity_enu)
-        six = _upper_triangle(covariance)
-        if not any(six) or six[0] < 0.0:
-            variance = gnss.unknown_velocity_std**2
-            six = (variance, 0.0, 0.0, variance, 0.0, variance)
-        six, trusted = _conditioned(six, gnss.covariance_scale, gnss.velocity_std_floor)
+        matrix = np.ascontiguousarray(covariance, np.float64)
+        stand_in = NO_STAND_IN
+        if matrix[0] < 0.0 or not matrix.any():
+            stand_in = (gnss.unknown_velocity_std**2,) * 3
+        values = (float(velocity_enu[0]), float(velocity_enu[1]), float(velocity_enu[2]))
+        aid = self._admit(values, matrix, stand_in, gnss.covariance_scale, gnss.velocity_std_floor)
         if not gnss.use_velocity:
-            door = Verdict.DISABLED
-        elif not all(map(math.isfinite, values)):
-            door = Verdict.NON_FINITE
-        elif max(map(abs, values)) > 600.0:
-            door = Verdict.BAD_VALUE
-        else:
-            door = trusted
-        self._push_aid(Stream.GNSS_VELOCITY, stamp + self._gnss_offset, arrival, door, (*values, *six))
+            aid["door"] = Verdict.DISABLED
+        elif aid["door"] == Verdict.WAITING and max(map(abs, values)) > HIGHEST_SPEED:
+            aid["door"] = Verdict.BAD_VALUE
+        self._push_aid(Stream.GNSS_VELOCITY, stamp + self._gnss_offset, arrival)
 
     def take_records(self) -> np.ndarray:
         """Return the records (RECORD) that became final since the last call: in the total order, the too late last."""
@@ -332,8 +345,8 @@ class Navigator:
     def odometry(self) -> np.ndarray:
         """One ODOMETRY row of the state at the newest IMU sample (array of length one)."""
         row = allocate(ODOMETRY)
-        write_odometry(self._states[0], self._settings[0], row[0])
-        return np.array(row, ODOMETRY)
+        write_odometry(self._states[0], self._local[0], self._settings[0], row[0])
+        return _copied(row, 1)
 
     @property
     def state(self) -> np.ndarray:
@@ -374,6 +387,11 @@ class Navigator:
     def complaints(self) -> list[str]:
         """What is wrong with whole streams, one sentence each with what to do; empty when nothing is."""
         found = complaints(self._states[0])
+        if self._stand_ins:
+            found.append(
+                f"{self._stand_ins} GNSS messages came without a covariance (unknown type or all zero): "
+                "gnss.status_std_horizontal, gnss.status_std_vertical and gnss.unknown_velocity_std stand in for it"
+            )
         for stream, difference in self._stamp_difference.items():
             if 2 * self._refused_count[stream] > self._offered_count[stream]:
                 found.append(
@@ -388,20 +406,30 @@ class Navigator:
         """Memory of the history buffers: grows with window and rates, not with time."""
         return sum(buffer.nbytes for buffer in (self._imu, self._aids, self._checkpoints, self._rows))
 
-    def _push_aid(self, stream: Stream, stamp: int, arrival: int, door: Verdict, payload: Sequence[float]) -> None:
+    def _admit(
+        self,
+        values: tuple[float, float, float],
+        covariance: FloatArray,
+        stand_in: tuple[float, float, float],
+        scale: float,
+        std_floor: float,
+    ) -> np.ndarray:
+        """Fill the record that is on offer, and judge its payload."""
+        admit(self._offered, values, covariance, stand_in, scale, std_floor)
+        aid = self._offered[0]
+        if aid["door"] == Verdict.WAITING and stand_in is not NO_STAND_IN:
+            self._stand_ins += 1
+        return aid
+
+    def _push_aid(self, stream: Stream, stamp: int, arrival: int) -> None:
+        """Sort the record that is on offer into the timeline."""
         self._offered_count[stream] += 1
-        frontier = int(self._timeline["frontier"][0])
-        early = frontier == NEVER and int(self._timeline["aid_count"][0]) >= EARLY_AIDS
-        if stamp <= 0 or (frontier != NEVER and stamp > frontier + LARGEST_JUMP):
-            self._refuse(stream, stamp, arrival, Verdict.BAD_STAMP)
-            return
-        if early:
-            self._refuse(stream, stamp, arrival, Verdict.BEFORE_ALIGNMENT)
-            return
+        aid = self._offered[0]
+        aid["stamp"], aid["arrival"], aid["stream"], aid["verdict"] = stamp, arrival, stream, aid["door"]
         self._make_room()
-        self._offered[0] = (stamp, arrival, stream, door, door, 0, math.nan, (math.nan,) * 3, tuple(payload))
-        if not insert_aid(self._aids, self._timeline, self._offered):
-            self._refuse(stream, stamp, arrival, Verdict.OUTSIDE_HISTORY)
+        refused = insert_aid(self._aids, self._timeline, self._offered)
+        if refused:
+            self._refuse(stream, stamp, arrival, Verdict(refused))
 
     def _refuse(self, stream: Stream, stamp: int, arrival: int, verdict: Verdict) -> None:
         """Record a measurement that never enters the timeline."""
@@ -438,6 +466,11 @@ class Navigator:
             self._checkpoints = doubled(self._checkpoints)
 
 
+def _copied(records: np.ndarray, count: int) -> np.ndarray:
+    """Return the first records in memory of their own: through bytes, because numpy copies them field by field."""
+    return np.frombuffer(bytearray(records[:count].tobytes()), records.dtype)
+
+
 def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarray:
     """Return the parameters as the kernels use them (SETTINGS): radians, lever arms from the IMU in its axes."""
     settings = allocate(SETTINGS)
@@ -472,26 +505,3 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
     settings["good_heading_std"] = math.radians(alignment.good_heading_std_deg)
     settings["output_interval"] = round(SECOND / output_rate) if output_rate > 0.0 else 0
     return settings
-
-
-def _upper_triangle(covariance: Sequence[float] | FloatArray) -> tuple[float, ...]:
-    c = [float(value) for value in covariance]
-    return (c[0], c[1], c[2], c[4], c[5], c[8])
-
-
-def _conditioned(six: tuple[float, ...], scale: float, std_floor: float) -> tuple[tuple[float, ...], Verdict]:
-    """Scale a covariance (six numbers), lift it to the floor, and say whether it is one."""
-    if not all(map(math.isfinite, six)):
-        return six, Verdict.NON_FINITE
-    xx, xy, xz, yy, yz, zz = (scale * value for value in six)
-    # Raising the diagonal to the floor keeps a positive semidefinite matrix one.
-    floor = std_floor**2
-    lifted = (max(xx, floor), xy, xz, max(yy, floor), yz, max(zz, floor))
-    minor = lifted[0] * lifted[3] - xy * xy
-    determinant = (
-        lifted[0] * (lifted[3] * lifted[5] - yz * yz)
-        - xy * (xy * lifted[5] - yz * xz)
-        + xz * (xy * yz - lifted[3] * xz)
-    )
-    sound = min(xx, yy, zz) >= 0.0 and minor > 0.0 and determinant > 0.0
-    return lifted, Verdict.WAITING if sound else Verdict.BAD_COVARIANCE

@@ -6,8 +6,9 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.aiding.gnss_velocity import body_rate
+from eskf_ros.filter.alignment import heading_of
 from eskf_ros.filter.layout import ACCEL_BIAS, ATTITUDE, GYRO_BIAS, NEVER, POSITION, VELOCITY, Status
-from eskf_ros.rotation import cross, from_matrix, rotate, rotate_back, to_matrix
+from eskf_ros.rotation import cross, from_matrix, from_rotation_vector, multiply, rotate, rotate_back, to_matrix
 
 WAITING_IMU = int(Status.WAITING_IMU)
 LEVELLING = int(Status.LEVELLING)
@@ -59,8 +60,8 @@ def attitude_base_to_map(state, settings):
 
 
 @njit
-def write_odometry(state, settings, row):
-    """Fill one ODOMETRY row from the state.
+def write_odometry(state, local, settings, row):
+    """Fill one ODOMETRY row from the state and the local pose.
 
     The pose error of base_link is that of the IMU plus [R m]x theta, m the IMU's place in base_link; the twist error
     in base_link axes is R' (dv + v x theta), v the velocity of the IMU (first order; Sola, section 4.4).
@@ -90,8 +91,23 @@ def write_odometry(state, settings, row):
         row.gyro_bias[i] = state.gyro_bias[i]
         row.accel_bias_std[i] = math.sqrt(covariance[ACCEL_BIAS + i, ACCEL_BIAS + i])
         row.gyro_bias_std[i] = math.sqrt(covariance[GYRO_BIAS + i, GYRO_BIAS + i])
+    write_local_pose(state, local, attitude, settings, row)
     write_pose_covariance(covariance, imu_offset, row)
     write_twist_covariance(state, base_to_map, settings, row)
+
+
+@njit
+def write_local_pose(state, local, attitude, settings, row):
+    """Write the pose of base_link in odom; ``attitude`` is the quaternion from base_link to map."""
+    turn = from_rotation_vector((0.0, 0.0, local.heading - heading_of(state, settings)))
+    attitude_odom = multiply(turn, attitude)
+    imu_offset = rotate(to_matrix(attitude_odom), settings.imu_position_base)
+    for i in range(4):
+        row.attitude_body_to_odom[i] = attitude_odom[i]
+    for i in range(3):
+        row.position_odom[i] = local.position[i] - imu_offset[i]
+    row.local_position_variance = local.position_variance
+    row.local_heading_variance = local.heading_variance
 
 
 @njit

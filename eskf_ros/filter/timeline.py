@@ -15,7 +15,15 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.layout import NEVER, allocate
+from eskf_ros.filter.layout import NEVER, Verdict, allocate
+
+WAITING = int(Verdict.WAITING)
+BAD_STAMP = int(Verdict.BAD_STAMP)
+BEFORE_ALIGNMENT = int(Verdict.BEFORE_ALIGNMENT)
+OUTSIDE_HISTORY = int(Verdict.OUTSIDE_HISTORY)
+
+EARLY_AIDS = 4096
+"""So many aids may wait for the first IMU sample."""
 
 CHECKPOINT_SPACING = 16
 """IMU samples from one checkpoint to the next: what a rewind does again in vain, at the most."""
@@ -159,12 +167,19 @@ def comes_before(a, b):
 
 @njit
 def insert_aid(aids, timeline, offered):
-    """Sort one offered measurement into the buffer, which has room; return False when it is too late."""
+    """Sort one offered measurement into the buffer, which has room; return the verdict when the door stays shut.
+
+    Too old for the window, or absurdly far ahead of the newest IMU sample: then it never enters.
+    """
     t = timeline[0]
     aid = offered[0]
+    if aid.stamp <= 0 or (t.frontier != NEVER and aid.stamp > t.frontier + LARGEST_JUMP):
+        return BAD_STAMP
+    if t.frontier == NEVER and t.aid_count >= EARLY_AIDS:
+        return BEFORE_ALIGNMENT
     if t.frontier != NEVER and aid.stamp < t.frontier - t.window:
         t.furthest_late = max(t.furthest_late, t.frontier - aid.stamp)
-        return False
+        return OUTSIDE_HISTORY
     place = t.aid_count
     while place > 0 and comes_before(aid, aids[place - 1]):
         place -= 1
@@ -173,7 +188,7 @@ def insert_aid(aids, timeline, offered):
     aids[place] = aid
     t.aid_count += 1
     go_back_to(t, aid.stamp)
-    return True
+    return WAITING
 
 
 @njit
