@@ -135,7 +135,9 @@ def error_row(label: str, summary: dict[str, Any]) -> list[str]:
         *(metres(summary["error"][axis][key] for key in ("rms", "p50", "p95", "max")) for axis in AXES),
         "; ".join(f"{aid['nis_mean']:.2f}, {aid['nis_in_95']:.1%}" for aid in aids),
         f"{nees['mean']:.2f}, {nees['in_95']:.1%}",
-        "; ".join(f"{aid['verdicts'].get('gate', 0)} of {aid['offered']}" for aid in aids),
+        "; ".join(
+            f"{aid['rejected'] - aid['verdicts'].get('before_alignment', 0)} of {aid['offered']}" for aid in aids
+        ),
         str(restarts(summary)),
     ]
 
