@@ -102,8 +102,3 @@ def measure() -> list[tuple[str, str, str]]:
         ("estimator, per IMU sample in single calls", f"{call_microseconds(slow, 40 * 200):.1f} us", ""),
         ("a fix 500 ms late at 1000 Hz", f"{late_fix_milliseconds(fast, 40 * 1000, 0.5):.2f} ms", "1 ms"),
     ]
-
-
-if __name__ == "__main__":
-    for row in measure():
-        print("{:45s} {:>10s}   target {}".format(*row))

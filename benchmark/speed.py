@@ -1,6 +1,6 @@
-"""How long eskf_replay takes for an hour of driving, stage by stage, and how much memory.
+"""The speed of the estimator per IMU sample and per late fix; that of eskf_replay for an hour, by stage, with memory.
 
-    python benchmark/replay_speed.py [--runs 3]
+    python benchmark/speed.py [--runs 3]
 
 The recording is the simulator's hour_drive: 200 Hz IMU, 5 Hz fixes and velocities, mcap with zstd; it is made once and
 kept in the folder for temporary files. Its first ten minutes show whether memory grows with the length. Every run is a
@@ -18,6 +18,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from estimator_speed import measure as measure_estimator
 from rich.console import Console
 from rich.table import Table
 
@@ -98,6 +99,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=3, help="the fastest of so many runs is shown (default 3)")
     runs = parser.parse_args().runs
+    estimator = Table("estimator", "best", "target")
+    for row in measure_estimator():
+        estimator.add_row(*row)
+    Console().print(estimator)
     cache = Path(tempfile.gettempdir()) / "eskf_ros_benchmark"
     cache.mkdir(exist_ok=True)
     bags = recordings(cache)
