@@ -1,0 +1,244 @@
+"""Imu and Odometry between their serialised form and numbers, without message objects in between.
+
+At 1 kHz the message objects of rclpy cost more than the filter. So the node subscribes to and publishes serialised
+messages (OMG CDR): 4 bytes of encapsulation, then the fields, each aligned to its own size counted from byte 4. A
+string is a uint32 length, which counts the closing NUL, and the bytes; so everything after the strings lies at a
+place that depends only on their lengths. Only little-endian CDR (00 01 00 00) is handled here, which is what every ROS
+machine of today sends; the classes with `message` in their name do the rest the ordinary way.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+ImuSample = tuple[int, tuple[float, ...], tuple[float, ...], bytes]
+"""Stamp (ns), specific force (m/s2), angular rate (rad/s), both in IMU axes, and header.frame_id (UTF-8, no NUL)."""
+
+_LITTLE_ENDIAN_CDR = 0x0100
+_IMU_DOUBLES = 37
+_ODOMETRY_DOUBLES = 85
+
+
+class LayoutError(RuntimeError):
+    """The message library does not read what was written here: its Odometry is not the one this module knows."""
+
+
+def _aligned(position: int, size: int) -> int:
+    return -(-position // size) * size
+
+
+@lru_cache(maxsize=64)
+def _imu_layout(frame_length: int) -> struct.Struct:
+    """Encapsulation, seconds, nanoseconds, string length, string with NUL, angular velocity, linear acceleration."""
+    padding = _aligned(12 + frame_length, 8) - (12 + frame_length)
+    orientation_with_covariance, covariance = 13 * 8, 9 * 8
+    return struct.Struct(f"<IiII{frame_length}s{padding + orientation_with_covariance}x3d{covariance}x3d{covariance}x")
+
+
+class ImuReader:
+    """Reads serialised sensor_msgs/Imu; one reader for each subscription, as it remembers the header's length."""
+
+    def __init__(self) -> None:
+        self._set_frame_length(1)
+        self._terminated = b""
+        self._frame = b""
+
+    def read(self, data: bytes) -> ImuSample | None:
+        """The numbers of one message; None if it is not laid out as expected, for whatever reason.
+
+        Any bytes may be given, nothing is raised. The numbers are not judged: NaN and absurd values pass. None asks for
+        the ordinary way, `imu_from_message`, which may well find the message good.
+        """
+        if len(data) != self._size and not self._adapt(data):
+            return None
+        values = self._layout.unpack_from(data)
+        if values[3] != self._frame_length:  # eight lengths of the string make messages of one size
+            if not self._adapt(data):
+                return None
+            values = self._layout.unpack_from(data)
+        encapsulation, seconds, nanoseconds, _, terminated = values[:5]
+        if encapsulation != _LITTLE_ENDIAN_CDR:
+            return None
+        if terminated != self._terminated:
+            if terminated.find(0) != len(terminated) - 1:
+                return None
+            self._terminated, self._frame = terminated, terminated[:-1]
+        return seconds * 1_000_000_000 + nanoseconds, values[8:11], values[5:8], self._frame
+
+    def _adapt(self, data: bytes) -> bool:
+        """Take over the length of the frame name in `data`; False if that is no Imu of this form."""
+        if len(data) < 16:
+            return False
+        frame_length = int.from_bytes(data[12:16], "little")
+        if frame_length < 1 or len(data) != 4 + _aligned(12 + frame_length, 8) + 8 * _IMU_DOUBLES:
+            return False
+        self._set_frame_length(frame_length)
+        return True
+
+    def _set_frame_length(self, frame_length: int) -> None:
+        self._frame_length = frame_length
+        self._layout = _imu_layout(frame_length)
+        self._size = self._layout.size
+
+
+def imu_from_message(message: Any) -> ImuSample:
+    """The same numbers out of a sensor_msgs/Imu object, as `deserialize_message` returns it."""
+    stamp, force, rate = message.header.stamp, message.linear_acceleration, message.angular_velocity
+    return (
+        stamp.sec * 1_000_000_000 + stamp.nanosec,
+        (force.x, force.y, force.z),
+        (rate.x, rate.y, rate.z),
+        message.header.frame_id.encode(),
+    )
+
+
+class AnyOdometryWriter(Protocol):
+    """What `publisher.publish` takes for one odometry: made by either of the two writers below."""
+
+    def write(
+        self,
+        stamp: int,
+        position: Sequence[float],
+        quaternion: Sequence[float],
+        pose_covariance: NDArray[np.float64],
+        linear_velocity: Sequence[float],
+        angular_velocity: Sequence[float],
+        twist_covariance: NDArray[np.float64],
+    ) -> Any: ...
+
+
+class OdometryWriter:
+    """Writes nav_msgs/Odometry for two fixed frame names into prepared bytes."""
+
+    def __init__(self, frame_id: str, child_frame_id: str) -> None:
+        """Prepare the bytes and have the message library read them back.
+
+        Raises LayoutError if it reads anything else than was written; ImportError without rclpy and nav_msgs.
+        """
+        frames = b""
+        for name in (frame_id, child_frame_id):
+            terminated = name.encode() + b"\0"
+            frames += b"\0" * (_aligned(len(frames), 4) - len(frames))
+            frames += struct.pack("<I", len(terminated)) + terminated
+        doubles = 4 + _aligned(8 + len(frames), 8)
+        self._buffer = bytearray(doubles + 8 * _ODOMETRY_DOUBLES)
+        struct.pack_into("<I8x", self._buffer, 0, _LITTLE_ENDIAN_CDR)
+        self._buffer[12 : 12 + len(frames)] = frames
+        self._pack_stamp = struct.Struct("<iI").pack_into
+        self._pack_pose = struct.Struct("<7d").pack_into
+        self._pack_twist = struct.Struct("<6d").pack_into
+        self._pose_at = doubles
+        self._twist_at = doubles + 8 * (7 + 36)
+        self._pose_covariance = np.ndarray((6, 6), "<f8", self._buffer, doubles + 8 * 7)
+        self._twist_covariance = np.ndarray((6, 6), "<f8", self._buffer, self._twist_at + 8 * 6)
+        self._verify(frame_id, child_frame_id)
+
+    def write(
+        self,
+        stamp: int,
+        position: Sequence[float],
+        quaternion: Sequence[float],
+        pose_covariance: NDArray[np.float64],
+        linear_velocity: Sequence[float],
+        angular_velocity: Sequence[float],
+        twist_covariance: NDArray[np.float64],
+    ) -> bytes:
+        """One serialised Odometry.
+
+        `stamp` in ns; `position` (3,) m and `quaternion` (4,) w x y z of the child frame in the frame; velocities (3,)
+        m/s and rad/s in the child frame; covariances (6, 6) in the order of the message. Vectors as tuples or lists
+        (`.tolist()`): arrays work too, but take three times as long.
+        """
+        buffer = self._buffer
+        w, x, y, z = quaternion
+        self._pack_stamp(buffer, 4, *divmod(stamp, 1_000_000_000))
+        self._pack_pose(buffer, self._pose_at, *position, x, y, z, w)
+        self._pose_covariance[:] = pose_covariance
+        self._pack_twist(buffer, self._twist_at, *linear_velocity, *angular_velocity)
+        self._twist_covariance[:] = twist_covariance
+        return bytes(buffer)
+
+    def _verify(self, frame_id: str, child_frame_id: str) -> None:
+        """Write a different number to every place and compare what the message library reads with it."""
+        from nav_msgs.msg import Odometry
+        from rclpy.serialization import deserialize_message
+
+        numbers = np.arange(1.0, 1.0 + _ODOMETRY_DOUBLES)
+        position, (x, y, z, w), pose_covariance, linear, angular, twist_covariance = np.split(
+            numbers, np.cumsum([3, 4, 36, 3, 3])
+        )
+        data = self.write(
+            1_000_000_002,
+            position,
+            (w, x, y, z),
+            pose_covariance.reshape(6, 6),
+            linear,
+            angular,
+            twist_covariance.reshape(6, 6),
+        )
+        try:
+            message = deserialize_message(data, Odometry)
+            stamp, pose, twist = message.header.stamp, message.pose, message.twist
+            read = [
+                *(getattr(pose.pose.position, axis) for axis in "xyz"),
+                *(getattr(pose.pose.orientation, axis) for axis in "xyzw"),
+                *pose.covariance,
+                *(getattr(twist.twist.linear, axis) for axis in "xyz"),
+                *(getattr(twist.twist.angular, axis) for axis in "xyz"),
+                *twist.covariance,
+            ]
+            header = (stamp.sec, stamp.nanosec, message.header.frame_id, message.child_frame_id)
+        except Exception as error:
+            raise LayoutError(f"nav_msgs/Odometry: the message library cannot read prepared bytes: {error}") from error
+        if header != (1, 2, frame_id, child_frame_id) or read != numbers.tolist():
+            raise LayoutError("nav_msgs/Odometry is laid out differently by this message library")
+
+
+class OdometryMessageWriter:
+    """The ordinary way, slower by the making of a message: same use as OdometryWriter, message objects come out."""
+
+    def __init__(self, frame_id: str, child_frame_id: str) -> None:
+        """Raises ImportError without nav_msgs."""
+        from nav_msgs.msg import Odometry
+
+        self._message_type = Odometry
+        self._frame_id = frame_id
+        self._child_frame_id = child_frame_id
+
+    def write(
+        self,
+        stamp: int,
+        position: Sequence[float],
+        quaternion: Sequence[float],
+        pose_covariance: NDArray[np.float64],
+        linear_velocity: Sequence[float],
+        angular_velocity: Sequence[float],
+        twist_covariance: NDArray[np.float64],
+    ) -> Any:
+        """One nav_msgs/Odometry; arguments as in `OdometryWriter.write`.
+
+        The setters of rclpy do not check: everything but a Python float, or a flat float64 array, becomes garbage.
+        """
+        message = self._message_type()
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(int(stamp), 1_000_000_000)
+        message.header.frame_id = self._frame_id
+        message.child_frame_id = self._child_frame_id
+        pose, twist = message.pose.pose, message.twist.twist
+        pose.position.x, pose.position.y, pose.position.z = map(float, position)
+        orientation = pose.orientation
+        orientation.w, orientation.x, orientation.y, orientation.z = map(float, quaternion)
+        twist.linear.x, twist.linear.y, twist.linear.z = map(float, linear_velocity)
+        twist.angular.x, twist.angular.y, twist.angular.z = map(float, angular_velocity)
+        message.pose.covariance = _flat(pose_covariance)
+        message.twist.covariance = _flat(twist_covariance)
+        return message
+
+
+def _flat(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(covariance, np.float64).reshape(36)
