@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import re
 import sys
 import tempfile
 from collections.abc import Iterable, Sequence
@@ -138,7 +137,7 @@ def error_row(label: str, summary: dict[str, Any]) -> list[str]:
         "; ".join(
             f"{aid['rejected'] - aid['verdicts'].get('before_alignment', 0)} of {aid['offered']}" for aid in aids
         ),
-        str(restarts(summary)),
+        str(summary["restarts"]),
     ]
 
 
@@ -150,18 +149,12 @@ def outage_row(label: str, replays: Sequence[Replay]) -> list[str]:
         errors = [outage[axis] for outage in outages]
         cells.append(metres([np.median(errors), np.percentile(errors, 95), max(errors)]))
     inside = sum(replay.ends_inside() for replay in replays)
-    return [label, str(len(outages)), *cells, str(inside), str(sum(restarts(replay.summary) for replay in replays))]
+    return [label, str(len(outages)), *cells, str(inside), str(sum(replay.summary["restarts"] for replay in replays))]
 
 
 def metres(values: Iterable[float]) -> str:
     """Lengths in a cell: millimetres below a metre, centimetres above."""
     return " / ".join(f"{value:.3f}" if value < 1.0 else f"{value:.2f}" for value in values)
-
-
-def restarts(summary: dict[str, Any]) -> int:
-    """How often the alignment started again, which the summary tells as a warning."""
-    found = [re.search(r"alignment started again (\d+) times", warning) for warning in summary["warnings"]]
-    return sum(int(match[1]) for match in found if match)
 
 
 def table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -73,7 +73,8 @@ if COMPILED:
         if CACHE_FOLDER is not None:
             numba.config.CACHE_DIR = str(CACHE_FOLDER)
         try:
-            return numba.njit(cache=True, error_model="numpy")(function)
+            # Fused multiply-add: quicker, and it rounds once instead of twice.
+            return numba.njit(cache=True, error_model="numpy", fastmath={"contract"})(function)
         finally:
             numba.config.CACHE_DIR = previous
 

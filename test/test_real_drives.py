@@ -122,9 +122,6 @@ def test_velocity_halves_the_error_between_fixes(kitti: Callable[[bool], Recordi
     assert with_velocity["error"]["horizontal"]["rms"] < 0.6 * without["error"]["horizontal"]["rms"]
 
 
-@pytest.mark.xfail(
-    strict=True, reason="after a stretch the noise does not cover, fix after fix is rejected and the alignment restarts"
-)
 def test_kitti_with_default_noise_is_never_lost(kitti: Callable[[bool], Recording]) -> None:
     for with_velocity, rms, most in ((False, 5.4, 13.6), (True, 2.7, 4.9)):
         recording = kitti(with_velocity)
@@ -133,9 +130,6 @@ def test_kitti_with_default_noise_is_never_lost(kitti: Callable[[bool], Recordin
         assert_within(summary, "horizontal", rms=rms, p95=most)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="after a stretch the noise does not cover, fix after fix is rejected and the alignment restarts"
-)
 def test_drive_0708_with_default_noise_is_never_lost(drive_0708: Callable[[bool], Recording]) -> None:
     for with_velocity in (False, True):
         recording = drive_0708(with_velocity)

@@ -134,3 +134,6 @@ def transform_attitude_error(covariance, matrix):
         theta = rotate(matrix, (covariance[j, ATTITUDE], covariance[j, ATTITUDE + 1], covariance[j, ATTITUDE + 2]))
         for i in range(3):
             covariance[j, ATTITUDE + i] = theta[i]
+    for i in range(3):
+        for j in range(i):
+            covariance[ATTITUDE + i, ATTITUDE + j] = covariance[ATTITUDE + j, ATTITUDE + i]

@@ -54,6 +54,7 @@ class Verdict(IntEnum):
     BEFORE_ALIGNMENT = 9
     OUTSIDE_HISTORY = 10
     DISABLED = 11
+    WEIGHED_DOWN = 12
 
 
 class Stream(IntEnum):

@@ -43,7 +43,7 @@ from eskf_ros.filter.layout import (
 from eskf_ros.filter.local import carry, measure_step, note_jump
 from eskf_ros.filter.monitors import complaints
 from eskf_ros.filter.output import status_of, write_odometry
-from eskf_ros.filter.recovery import judge_filter
+from eskf_ros.filter.recovery import is_near_gate, judge_filter, update_weighed_down
 from eskf_ros.filter.strapdown import SECOND, propagate
 from eskf_ros.filter.timeline import (
     CHECKPOINT_SPACING,
@@ -181,6 +181,9 @@ def fuse(state, aids, i, settings, work):
         aid.innovation[k] = work.innovation[k]
     aid.dof = size
     aid.verdict, aid.nis = update(state, size, settings.gate[size], work)
+    if aid.stream == GNSS_POSITION and is_near_gate(aid.verdict, aid.nis, settings.gate[size]):
+        linearize(state, aid, settings, work)
+        aid.verdict = update_weighed_down(state, size, aid.nis / settings.gate[size], work)
     if aid.verdict == FUSED and state.heading_known == 0:
         align_to_course(state, settings)
     if aid.stream == GNSS_POSITION:

@@ -1,17 +1,45 @@
-"""Recovery: when fix after fix contradicts the filter, the filter is taken to be wrong and starts again."""
+"""Recovery: a fix not far outside the gate corrects a little; when fix after fix is outside, the filter starts again.
+
+Where the IMU was worse than its parameters say, a filter that ignores the first fix outside the gate ignores all that
+follow: its error and its sigma grow alike.
+"""
 
 from __future__ import annotations
+
+import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment import restart
 from eskf_ros.filter.layout import NEVER, Verdict
+from eskf_ros.filter.update import project, update
 
 FUSED = int(Verdict.FUSED)
 GATE = int(Verdict.GATE)
+WEIGHED_DOWN = int(Verdict.WEIGHED_DOWN)
 
 REJECTED_FIXES = 5
 REJECTED_TIME = 5_000_000_000
 """So many fixes in a row, over at least this long (ns), outside the gate: more than an outlier or a multipath step."""
+
+NEAR_GATE = 4.0
+"""Up to so many times the gate (twice the innovation) a filter may be too sure of itself; beyond, the fix is wrong."""
+
+
+@njit
+def is_near_gate(verdict, nis, gate):
+    """Say whether a rejected fix is close enough to the gate to be weighed down instead."""
+    return verdict == GATE and nis <= NEAR_GATE * gate
+
+
+@njit
+def update_weighed_down(state, size, excess, work):
+    """Fuse what ``work`` describes with so much more noise that its NIS, ``excess`` gates, is on the gate."""
+    project(state.covariance, size, work)
+    for a in range(size):
+        for b in range(size):
+            work.noise[a, b] += (excess - 1.0) * work.innovation_covariance[a, b]
+    update(state, size, math.inf, work)
+    return WEIGHED_DOWN
 
 
 @njit
@@ -22,7 +50,7 @@ def judge_filter(state, verdict):
             state.absolute_interval = state.stamp - state.absolute_stamp
         state.absolute_stamp = state.stamp
         state.rejected_fixes = 0
-    elif verdict == GATE:
+    elif verdict in (GATE, WEIGHED_DOWN):
         state.rejected_fixes += 1
         if state.rejected_fixes >= REJECTED_FIXES and state.stamp - state.absolute_stamp >= REJECTED_TIME:
             restart(state)

@@ -25,7 +25,7 @@ OUTSIDE_HISTORY = int(Verdict.OUTSIDE_HISTORY)
 EARLY_AIDS = 4096
 """So many aids may wait for the first IMU sample."""
 
-CHECKPOINT_SPACING = 16
+CHECKPOINT_SPACING = 8
 """IMU samples from one checkpoint to the next: what a rewind does again in vain, at the most."""
 
 LARGEST_FORCE = 1000.0

@@ -3,8 +3,10 @@
 Stamps are integer ns, lengths m, times s; what is not known is null.
 
 - `duration_s`: from the first to the newest IMU stamp; `imu_count`: samples offered; `imu`: what became of them.
-- `aids.{name}`: `offered` measurements by their final verdict: `fused`, `late` (outside_history), `rejected` (all other
-  verdicts but waiting, which is for those newer than the last IMU sample); all of them in `verdicts`. `withheld` were
+  `restarts`: how often the alignment started again.
+- `aids.{name}`: `offered` measurements by their final verdict: `fused` (weighed_down ones too), `late`
+  (outside_history), `rejected` (all other verdicts but waiting, which is for those newer than the last IMU sample); all
+  of them in `verdicts`. `withheld` were
   not offered (--outage, --mode ins-only). `nis_mean` and `nis_in_95` are over all measurements that were tested, the
   gated ones included.
 - `..._in_95`, `in_95`: share of the values not above the 95 % quantile of chi-square (ideal 0.95, cautious above).
@@ -81,6 +83,7 @@ class Summary:
             "duration_s": duration,
             "imu_count": self._feed.imu_count,
             "imu": navigator.imu_counts,
+            "restarts": navigator.restarts,
             "wall_s": wall_s,
             "realtime_factor": duration / wall_s,
             "datum": None if navigator.datum is None else list(navigator.datum),
@@ -91,7 +94,8 @@ class Summary:
     def _aid(self, stream: Stream) -> dict[str, Any]:
         """`rejected` is every verdict but fused, waiting, and outside_history, which is `late`."""
         verdicts, tested = self._verdicts[stream], int(self._nis_count[stream])
-        fused, late, waiting = (int(verdicts[v]) for v in (Verdict.FUSED, Verdict.OUTSIDE_HISTORY, Verdict.WAITING))
+        fused = int(verdicts[Verdict.FUSED] + verdicts[Verdict.WEIGHED_DOWN])
+        late, waiting = int(verdicts[Verdict.OUTSIDE_HISTORY]), int(verdicts[Verdict.WAITING])
         offered = int(verdicts.sum())
         return {
             "offered": offered,
