@@ -1,11 +1,12 @@
 """For tests with the real node in its own process: an isolated DDS domain, an observer, and processes that always end.
 
 Each test process takes a domain id that no other one on this machine has, so tests may run side by side. A test module
-makes its own fixture of the observer:
+makes its own fixture of the observer, a new one for each test: it takes 10 ms, while an observer that saw a process end
+may take three seconds to see the next one.
 
     pytestmark = needs_ros
 
-    @pytest.fixture(scope="module")
+    @pytest.fixture
     def ros() -> Iterator[Ros]:
         with Ros() as observer:
             yield observer

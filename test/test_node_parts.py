@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 import signal
+import struct
 import subprocess
 import sys
 import textwrap
@@ -113,18 +114,46 @@ def test_imu_reader_leaves_everything_unusual_to_the_message_library() -> None:
         assert reader.read(good) == imu_from_message(deserialize_message(good, Imu)), f"after {why}"
 
 
+def serialized_imu(stamp: bytes, frame: bytes, padding: bytes, numbers: bytes) -> bytes:
+    """Put together as the definition of CDR says; 37 numbers."""
+    head = stamp + struct.pack("<I", len(frame) + 1) + frame + b"\0"
+    return b"\0\1\0\0" + head + padding[: -len(head) % 8] + numbers
+
+
+@given(
+    st.binary(min_size=8, max_size=8),
+    st.binary(max_size=40).map(lambda frame: frame.replace(b"\0", b"x")),
+    st.binary(min_size=8, max_size=8),
+    st.binary(min_size=37 * 8, max_size=37 * 8),
+)
+def test_imu_reader_reads_any_numbers(stamp: bytes, frame: bytes, padding: bytes, numbers: bytes) -> None:
+    """Any bits: NaN, infinities, denormals, names that are no text; what fills the gap after the name is garbage."""
+    sample = SHARED_READER.read(serialized_imu(stamp, frame, padding, numbers))
+    assert sample is not None
+    seconds, nanoseconds = struct.unpack("<iI", stamp)
+    assert sample[0] == seconds * SECOND + nanoseconds
+    doubles = np.frombuffer(numbers, "<f8")
+    np.testing.assert_array_equal(sample[1], doubles[25:28])
+    np.testing.assert_array_equal(sample[2], doubles[13:16])
+    assert sample[3] == frame
+
+
 @given(
     st.one_of(
         st.binary(max_size=400),
         st.builds(
-            lambda length, body: b"\0\1\0\0" + body[:8] + length.to_bytes(4, "little") + body[8:],
+            lambda length, body: b"\0\1\0\0" + body[:8] + struct.pack("<I", length) + body[8:],
             st.one_of(st.integers(0, 40), st.integers(0, 2**32 - 1)),
             st.binary(min_size=200, max_size=400),
         ),
-        st.integers(1, 40).flatmap(
-            lambda length: st.binary(
-                min_size=(length + 19) // 8 * 8 + 296 - 8 - 4, max_size=(length + 19) // 8 * 8 + 296 - 8 - 4
-            ).map(lambda body: b"\0\1\0\0" + body[:8] + length.to_bytes(4, "little") + body[8:])
+        st.builds(
+            lambda frame, place, wrong: bytes(
+                wrong if k == place else byte
+                for k, byte in enumerate(serialized_imu(b"12345678", frame, b"12345678", bytes(296)))
+            ),
+            st.binary(max_size=20),
+            st.integers(0, 50),
+            st.integers(0, 255),
         ),
     )
 )
@@ -136,7 +165,8 @@ def test_imu_reader_takes_any_bytes(data: bytes) -> None:
         assert isinstance(stamp, int)
         assert len(force) == len(rate) == 3
         assert all(isinstance(number, float) for number in (*force, *rate))
-        assert len(data) >= 4 + 12 + len(frame) + 1 + 296
+        assert b"\0" not in frame
+        assert data[16 : 16 + len(frame) + 1] == frame + b"\0"
 
 
 SHARED_READER = ImuReader()
@@ -570,7 +600,7 @@ run(Echo, stop)
 """
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def ros() -> Iterator[Ros]:
     with Ros() as observer:
         yield observer
@@ -655,6 +685,42 @@ def test_signals_under_load_end_with_exit_code_zero(
     assert process.stop() == 0
     assert process.output == "closed True\n"
     assert time.monotonic() - begin < 3.0
+
+
+@pytest.mark.parametrize("events_executor", [True, False])
+def test_either_executor_serves_the_node(
+    make_node: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, events_executor: bool
+) -> None:
+    """Installations of Jazzy before 7.1.4 have no events executor; the loop is the same."""
+    from rclpy.executors import SingleThreadedExecutor
+
+    from eskf_ros.node.life import StopFlag, make_executor, spin
+
+    if not events_executor:
+        monkeypatch.setitem(sys.modules, "rclpy.experimental.events_executor", None)
+    handlers = {number: signal.getsignal(number) for number in StopFlag.SIGNALS}
+    try:
+        stop = StopFlag()
+        node = make_node()
+        executor = make_executor(node.context)
+        assert isinstance(executor, SingleThreadedExecutor) is not events_executor
+        executor.shutdown()
+        calls: list[float] = []
+
+        def tick() -> None:
+            calls.append(time.monotonic())
+            if len(calls) == 5:
+                signal.raise_signal(signal.SIGTERM)
+
+        node.create_timer(0.01, tick)
+        begin = time.monotonic()
+        spin(node, stop)
+        assert stop.set
+        assert len(calls) in (5, 6)
+        assert time.monotonic() - begin < 2.0
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 @needs_ros
