@@ -135,7 +135,8 @@ def error_row(label: str, summary: dict[str, Any]) -> list[str]:
         "; ".join(f"{aid['nis_mean']:.2f}, {aid['nis_in_95']:.1%}" for aid in aids),
         f"{nees['mean']:.2f}, {nees['in_95']:.1%}",
         "; ".join(
-            f"{aid['rejected'] - aid['verdicts'].get('before_alignment', 0)} of {aid['offered']}" for aid in aids
+            f"{aid['verdicts'].get('gate', 0) + aid['verdicts'].get('weighed_down', 0)} of {aid['offered']}"
+            for aid in aids
         ),
         str(summary["restarts"]),
     ]
