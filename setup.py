@@ -33,7 +33,6 @@ setup(
         "lz4",
         "zstandard",
         "rich",
-        "matplotlib",
     ],
     extras_require={
         # Jazzy from PyPI: Linux on x86-64 only. Elsewhere, or beside /opt/ros, use the ROS installation instead.
@@ -43,6 +42,7 @@ setup(
             "ros-rclpy[fastrtps]==7.1.6; sys_platform == 'linux' and platform_machine == 'x86_64'",
         ],
         "test": [
+            "matplotlib",
             "gtsam",
             "hypothesis",
             "mypy",
@@ -53,6 +53,7 @@ setup(
     },
     entry_points={
         "console_scripts": [
+            "eskf_node = eskf_ros.node.main:main",
             "eskf_replay = eskf_ros.replay.main:main",
             "eskf_simulate = eskf_ros.simulate.main:main",
         ],

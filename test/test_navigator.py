@@ -319,3 +319,41 @@ def test_clocks_that_differ_are_named_with_the_difference(recording, offset):
     offer_position(navigator, int(recording.imu_stamp[-1]) + round(offset * SECOND))
     direction = "ahead of" if offset > 0.0 else "behind"
     assert [sentence for sentence in navigator.complaints if f"18.0 s {direction}" in sentence]
+
+
+def test_reset_forgets_everything(recording):
+    """After a reset the same messages give the same result as in a new navigator."""
+    navigator, _ = run(recording)
+    fresh = Navigator(navigator.parameters)
+    navigator.reset()
+    first = slice(0, 500)
+    arguments = (recording.imu_stamp[first], recording.specific_force[first], recording.angular_rate[first])
+    assert navigator.push_imu(*arguments).tobytes() == fresh.push_imu(*arguments).tobytes()
+    assert navigator.state.tobytes() == fresh.state.tobytes()
+
+
+def test_a_new_datum_is_the_same_place(recording):
+    """The map moves; on the Earth the robot stays where it is, and goes on navigating."""
+    navigator, _ = run(recording)
+    before, covariance = geodetic_of(navigator), navigator.state["covariance"][0]
+    heading_std = math.sqrt(covariance[8, 8])
+    assert navigator.set_datum_here()
+    assert geodetic_of(navigator) == pytest.approx(before, abs=1e-9)
+    assert navigator.datum == pytest.approx(before, abs=1e-9)
+    np.testing.assert_allclose(navigator.state["position_map"][0], 0.0, atol=1e-6)
+    assert math.sqrt(navigator.state["covariance"][0, 8, 8]) == pytest.approx(heading_std, rel=1e-3)
+    # A barrier: what is older is refused, what follows is fused.
+    offer_position(navigator, int(recording.imu_stamp[-1]) - SECOND)
+    stamp = int(recording.imu_stamp[-1])
+    for _ in range(10):
+        stamp += 10_000_000
+        navigator.push_imu(np.array([stamp]), recording.specific_force[-1:], recording.angular_rate[-1:])
+    latitude, longitude, altitude = geodetic_of(navigator)
+    offer_position(navigator, stamp - 1, latitude_deg=latitude, longitude_deg=longitude, altitude=altitude)
+    verdicts = navigator.finish()["verdict"].tolist()
+    assert verdicts[-1] == Verdict.OUTSIDE_HISTORY
+    assert verdicts[-2] == Verdict.FUSED
+
+
+def test_without_a_position_there_is_no_datum_here():
+    assert not Navigator(from_mapping({})).set_datum_here()

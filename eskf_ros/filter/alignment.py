@@ -12,13 +12,14 @@ import math
 from eskf_ros.compiled import njit
 from eskf_ros.earth import EARTH_RATE, STANDARD_GRAVITY, east_north_up_to_ecef, geodetic_to_ecef
 from eskf_ros.filter.aiding.gnss_position import position_of_fix
-from eskf_ros.filter.covariance import transform_attitude_error
+from eskf_ros.filter.covariance import transform_error
 from eskf_ros.filter.layout import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, NEVER, POSITION, VELOCITY
 from eskf_ros.filter.monitors import watch_input
 from eskf_ros.filter.strapdown import gravity_map
 from eskf_ros.rotation import (
     cross,
     dot,
+    from_matrix,
     from_rotation_vector,
     multiply,
     normalized,
@@ -64,6 +65,42 @@ def set_datum(state, latitude, longitude, altitude):
 
 
 @njit
+def move_datum(state, latitude, longitude, altitude):
+    """Describe the same state in the local frame of another datum (rad, rad, m): an exact rotation and shift."""
+    old = state.map_to_ecef
+    old_rows = ((old[0, 0], old[0, 1], old[0, 2]), (old[1, 0], old[1, 1], old[1, 2]), (old[2, 0], old[2, 1], old[2, 2]))
+    offset = rotate(old_rows, state.position_map)
+    ecef = (
+        state.origin_ecef[0] + offset[0],
+        state.origin_ecef[1] + offset[1],
+        state.origin_ecef[2] + offset[2],
+    )
+    set_datum(state, latitude, longitude, altitude)
+    origin = state.origin_ecef
+    position = rotate_back(state.map_to_ecef, (ecef[0] - origin[0], ecef[1] - origin[1], ecef[2] - origin[2]))
+    velocity = rotate_back(state.map_to_ecef, rotate(old_rows, state.velocity_map))
+    columns = (
+        rotate_back(state.map_to_ecef, (old_rows[0][0], old_rows[1][0], old_rows[2][0])),
+        rotate_back(state.map_to_ecef, (old_rows[0][1], old_rows[1][1], old_rows[2][1])),
+        rotate_back(state.map_to_ecef, (old_rows[0][2], old_rows[1][2], old_rows[2][2])),
+    )
+    turn = (
+        (columns[0][0], columns[1][0], columns[2][0]),
+        (columns[0][1], columns[1][1], columns[2][1]),
+        (columns[0][2], columns[1][2], columns[2][2]),
+    )
+    attitude = (state.attitude[0], state.attitude[1], state.attitude[2], state.attitude[3])
+    attitude = normalized(multiply(from_matrix(turn), attitude))
+    for i in range(4):
+        state.attitude[i] = attitude[i]
+    for i in range(3):
+        state.position_map[i] = position[i]
+        state.velocity_map[i] = velocity[i]
+    for block in (POSITION, VELOCITY, ATTITUDE):
+        transform_error(state.covariance, block, turn)
+
+
+@njit
 def local_up(state):
     """Return the unit vector against gravity (map axes) at the current position."""
     gravity = gravity_map(state, (state.position_map[0], state.position_map[1], state.position_map[2]))
@@ -79,7 +116,7 @@ def turn_attitude(state, rotation_vector):
     attitude = normalized(multiply(turn, attitude))
     for i in range(4):
         state.attitude[i] = attitude[i]
-    transform_attitude_error(state.covariance, to_matrix(turn))
+    transform_error(state.covariance, ATTITUDE, to_matrix(turn))
 
 
 @njit
@@ -358,7 +395,7 @@ def set_heading(state, heading, std, settings):
         (-up[1] * up[0], 1.0 - up[1] * up[1], -up[1] * up[2]),
         (-up[2] * up[0], -up[2] * up[1], 1.0 - up[2] * up[2]),
     )
-    transform_attitude_error(covariance, across)
+    transform_error(covariance, ATTITUDE, across)
     for i in range(3):
         for j in range(3):
             covariance[ATTITUDE + i, ATTITUDE + j] += up[i] * up[j] * std**2

@@ -20,7 +20,7 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import SEMI_MAJOR_AXIS
-from eskf_ros.filter.layout import ACCEL_BIAS, ATTITUDE, ERROR_SIZE
+from eskf_ros.filter.layout import ACCEL_BIAS, ERROR_SIZE
 from eskf_ros.rotation import rotate
 
 
@@ -124,16 +124,16 @@ def propagate_covariance(covariance, rotation, force, gravity, earth_rate, dt, c
 
 
 @njit
-def transform_attitude_error(covariance, matrix):
-    """Replace the attitude error theta by ``matrix`` theta (3x3 row tuples) in the covariance."""
+def transform_error(covariance, block, matrix):
+    """Replace the three errors from index ``block`` by ``matrix`` (3x3 row tuples) times themselves."""
     for j in range(ERROR_SIZE):
-        theta = rotate(matrix, (covariance[ATTITUDE, j], covariance[ATTITUDE + 1, j], covariance[ATTITUDE + 2, j]))
+        error = rotate(matrix, (covariance[block, j], covariance[block + 1, j], covariance[block + 2, j]))
         for i in range(3):
-            covariance[ATTITUDE + i, j] = theta[i]
+            covariance[block + i, j] = error[i]
     for j in range(ERROR_SIZE):
-        theta = rotate(matrix, (covariance[j, ATTITUDE], covariance[j, ATTITUDE + 1], covariance[j, ATTITUDE + 2]))
+        error = rotate(matrix, (covariance[j, block], covariance[j, block + 1], covariance[j, block + 2]))
         for i in range(3):
-            covariance[j, ATTITUDE + i] = theta[i]
+            covariance[j, block + i] = error[i]
     for i in range(3):
         for j in range(i):
-            covariance[ATTITUDE + i, ATTITUDE + j] = covariance[ATTITUDE + j, ATTITUDE + i]
+            covariance[block + i, block + j] = covariance[block + j, block + i]

@@ -182,6 +182,7 @@ TIMELINE = np.dtype(
         ("published", "i8"),
         ("rewind_to", "i8"),
         ("window", "i8"),
+        ("barrier", "i8"),
         ("furthest_late", "i8"),
         ("imu_offered", "i8"),
         ("imu_duplicate", "i8"),
@@ -195,8 +196,8 @@ TIMELINE = np.dtype(
 """Fill levels of the history buffers, the newest IMU stamp, how far back the next advance has to start; counters.
 
 ``recorded``: aids at the head of the buffer whose final record was handed out. ``published``: newest stamp for which
-a row was written. ``furthest_late``: largest lateness (ns) refused. ``imu_ahead``: refused samples in a row whose
-stamps were far ahead.
+a row was written. ``barrier``: nothing older is accepted. ``furthest_late``: largest lateness (ns) refused.
+``imu_ahead``: refused samples in a row whose stamps were far ahead.
 """
 
 SETTINGS = np.dtype(

@@ -11,10 +11,12 @@ import numpy.typing as npt
 from scipy.special import chdtri
 
 from eskf_ros.compiled import njit
+from eskf_ros.earth import ecef_to_geodetic
 from eskf_ros.filter.aiding import gnss_position, gnss_velocity
 from eskf_ros.filter.alignment import (
     align_to_course,
     heading_of,
+    move_datum,
     note_position,
     note_velocity,
     restart,
@@ -52,6 +54,7 @@ from eskf_ros.filter.timeline import (
     insert_aid,
     insert_imu,
     is_duplicate,
+    raise_barrier,
     rewind,
     save_checkpoint,
     take_final,
@@ -214,31 +217,55 @@ class Navigator:
 
     def __init__(self, parameters: Parameters, output_rate: float = 0.0) -> None:
         """Prepare a filter; ``output_rate`` (Hz) of the rows ``push_imu`` returns, 0 for every IMU sample."""
-        self.parameters = parameters
-        self._settings = settings_from(parameters, output_rate)
-        self._gnss_offset = round(parameters.gnss.time_offset * SECOND)
-        self._blank = blank_state()
-        if parameters.datum:
-            latitude, longitude, altitude = parameters.datum
-            set_datum(self._blank[0], math.radians(latitude), math.radians(longitude), altitude)
-        self._states = self._blank.copy()
-        self._timeline = allocate(TIMELINE)
-        self._timeline["frontier"] = NEVER
-        self._timeline["published"] = NEVER
-        self._timeline["rewind_to"] = -NEVER
-        self._timeline["window"] = round(parameters.history.window * SECOND)
+        self._output_rate = output_rate
         self._imu = allocate(IMU, 4 * IMU_BATCH)
         self._aids = allocate(AID, 256)
         self._checkpoints = allocate(STATE, 256)
         self._work = allocate(WORK)
-        self._local = allocate(LOCAL)
         self._rows = allocate(ODOMETRY, len(self._imu))
         self._offered = allocate(AID)
+        self.configure(parameters)
+        self.reset()
+
+    def configure(self, parameters: Parameters) -> None:
+        """Use other parameters from now on; history within the window is judged by them when it is applied again."""
+        self.parameters = parameters
+        self._settings = settings_from(parameters, self._output_rate)
+        self._gnss_offset = round(parameters.gnss.time_offset * SECOND)
+
+    def reset(self) -> None:
+        """Forget everything, the datum too unless it is a parameter; records that were not taken are lost."""
+        self._blank = blank_state()
+        if self.parameters.datum:
+            latitude, longitude, altitude = self.parameters.datum
+            set_datum(self._blank[0], math.radians(latitude), math.radians(longitude), altitude)
+        self._states = self._blank.copy()
+        self._timeline = allocate(TIMELINE)
+        for field in ("frontier", "published", "barrier"):
+            self._timeline[field] = NEVER
+        self._timeline["rewind_to"] = -NEVER
+        self._timeline["window"] = round(self.parameters.history.window * SECOND)
+        self._local = allocate(LOCAL)
         self._refused: list[np.ndarray] = []
         self._offered_count: Counter[Stream] = Counter()
         self._refused_count: Counter[Stream] = Counter()
         self._stamp_difference: dict[Stream, float] = {}
         self._stand_ins = 0
+
+    def set_datum_here(self) -> bool:
+        """Make the present position of the IMU the origin of the map; False while the position is unknown.
+
+        A barrier: what came before is final, and nothing older is accepted afterwards.
+        """
+        self.update()
+        state = self._states[0]
+        if not state["position_known"]:
+            return False
+        ecef = state["origin_ecef"] + state["map_to_ecef"] @ state["position_map"]
+        self._refused.insert(0, self._take_records(True))
+        move_datum(state, *ecef_to_geodetic(*ecef))
+        raise_barrier(self._states, self._blank, self._timeline)
+        return True
 
     def push_imu(
         self,

@@ -6,7 +6,7 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.aiding.gnss_velocity import body_rate
-from eskf_ros.filter.alignment import heading_of
+from eskf_ros.filter.alignment import UNKNOWN_SPEED, heading_of
 from eskf_ros.filter.layout import ACCEL_BIAS, ATTITUDE, GYRO_BIAS, NEVER, POSITION, VELOCITY, Status
 from eskf_ros.rotation import cross, from_matrix, from_rotation_vector, multiply, rotate, rotate_back, to_matrix
 
@@ -176,6 +176,8 @@ def write_twist_covariance(state, base_to_map, settings, row):
                     )
             if i == j:
                 angular += rate_variance
+                if state.position_known == 0:
+                    linear += UNKNOWN_SPEED**2
             row.twist_covariance[i, j] = linear
             row.twist_covariance[j, i] = linear
             row.twist_covariance[3 + i, 3 + j] = angular

@@ -46,6 +46,12 @@ def go_back_to(timeline, stamp):
 
 
 @njit
+def oldest_in_time(timeline):
+    """Return the oldest stamp that is still in time: within the window, and after the last barrier."""
+    return max(timeline.frontier - timeline.window, timeline.barrier)
+
+
+@njit
 def rewind(states, checkpoints, timeline, blank):
     """Restore the newest checkpoint not later than what was asked for, and drop the later ones."""
     if timeline.rewind_to > states[0].stamp:
@@ -106,7 +112,7 @@ def insert_imu(imu, timeline, stamps, specific_force, angular_rate, first):
             t.imu_bad_stamp += 1
             continue
         if t.frontier != NEVER:
-            if stamp < t.frontier - t.window:
+            if stamp < oldest_in_time(t):
                 t.imu_late += 1
                 t.furthest_late = max(t.furthest_late, t.frontier - stamp)
                 continue
@@ -177,7 +183,7 @@ def insert_aid(aids, timeline, offered):
         return BAD_STAMP
     if t.frontier == NEVER and t.aid_count >= EARLY_AIDS:
         return BEFORE_ALIGNMENT
-    if t.frontier != NEVER and aid.stamp < t.frontier - t.window:
+    if t.frontier != NEVER and aid.stamp < oldest_in_time(t):
         t.furthest_late = max(t.furthest_late, t.frontier - aid.stamp)
         return OUTSIDE_HISTORY
     place = t.aid_count
@@ -227,6 +233,20 @@ def forget(states, imu, aids, checkpoints, timeline):
         checkpoints[i].aid_next -= aid_gone
     states[0].imu_next -= imu_gone
     states[0].aid_next -= aid_gone
+
+
+@njit
+def raise_barrier(states, blank, timeline):
+    """Make the present the beginning: nothing older is accepted, and nothing rewinds past it. Buffers are emptied."""
+    t = timeline[0]
+    states[0].imu_next = 0
+    states[0].aid_next = 0
+    blank[0] = states[0]
+    t.imu_count = 0
+    t.aid_count = 0
+    t.recorded = 0
+    t.checkpoint_count = 0
+    t.barrier = t.frontier + 1
 
 
 @njit

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.covariance import transform_attitude_error
+from eskf_ros.filter.covariance import transform_error
 from eskf_ros.filter.layout import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, VELOCITY, Verdict
 from eskf_ros.rotation import from_rotation_vector, left_jacobian, multiply, normalized
 
@@ -48,7 +48,7 @@ def update(state, size, gate, work):
     inject(state, work.correction)
     # The error is now about the injected attitude (Sola, section 6.3.1, with the full Jacobian).
     turn = (work.correction[ATTITUDE], work.correction[ATTITUDE + 1], work.correction[ATTITUDE + 2])
-    transform_attitude_error(covariance, left_jacobian(turn))
+    transform_error(covariance, ATTITUDE, left_jacobian(turn))
     return FUSED, nis
 
 

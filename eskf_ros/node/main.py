@@ -1,0 +1,51 @@
+"""The command `eskf_node`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from eskf_ros.node.life import StopFlag, run
+
+USAGE = """\
+usage: eskf_node [--ros-args --params-file FILE -p NAME:=VALUE -r FROM:=TO ...]
+
+Error-state Kalman filter: imu/data and gps/fix (gps/vel) in, odometry/global and odometry/local out at IMU rate.
+config/eskf.yaml lists every parameter.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the node until SIGINT or SIGTERM; returns 0, or 2 when a parameter cannot be used."""
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    if words and words[0] in ("-h", "--help"):
+        print(USAGE, end="")
+        return 0
+    stop = StopFlag()
+    try:
+        from rclpy.executors import ExternalShutdownException  # noqa: F401 - tells whether ROS is there
+    except ImportError:
+        print(
+            "eskf_node: rclpy is not there: source a ROS 2 installation, or pip install eskf_ros[ros]",
+            file=sys.stderr,
+        )
+        return 2
+    from eskf_ros.parameters import ParameterError
+
+    try:
+        run(_create, stop, arguments)
+    except ParameterError as error:
+        print(f"eskf_node: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _create() -> Any:
+    from eskf_ros.node.node import EskfNode
+
+    return EskfNode()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

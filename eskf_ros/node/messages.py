@@ -1,0 +1,81 @@
+"""The messages the node sends seldom: biases, the filtered fix, the verdicts."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import TwistWithCovarianceStamped
+from sensor_msgs.msg import NavSatFix
+
+from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic, geodetic_to_ecef
+from eskf_ros.filter.layout import STREAM_NAMES, Verdict
+
+SECOND = 1_000_000_000
+
+
+def set_header(header: Any, stamp: int, frame: str) -> None:
+    """Fill in a message header; ``stamp`` in ns."""
+    header.stamp.sec, header.stamp.nanosec = divmod(stamp, SECOND)
+    header.frame_id = frame
+
+
+def key_values(values: dict[str, object]) -> list[KeyValue]:
+    """Turn a mapping into the form diagnostics have."""
+    return [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+
+
+def bias_message(row: np.void, frame: str) -> TwistWithCovarianceStamped:
+    """Biases in IMU axes: linear m/s2 of the accelerometer, angular rad/s of the gyro, with their variances."""
+    message = TwistWithCovarianceStamped()
+    set_header(message.header, max(0, int(row["stamp"])), frame)
+    linear, angular = message.twist.twist.linear, message.twist.twist.angular
+    linear.x, linear.y, linear.z = row["accel_bias"].tolist()
+    angular.x, angular.y, angular.z = row["gyro_bias"].tolist()
+    variances = np.concatenate([row["accel_bias_std"], row["gyro_bias_std"]]) ** 2
+    message.twist.covariance = np.diag(variances).ravel()
+    return message
+
+
+def fix_message(row: np.void, datum: tuple[float, float, float], frame: str) -> NavSatFix:
+    """The position of base_link as NavSatFix, covariance in east, north, up of the map."""
+    latitude, longitude = math.radians(datum[0]), math.radians(datum[1])
+    origin = geodetic_to_ecef(latitude, longitude, datum[2])
+    ecef = np.add(origin, np.array(east_north_up_to_ecef(latitude, longitude)) @ row["position_map"])
+    geodetic = ecef_to_geodetic(*ecef)
+    message = NavSatFix()
+    set_header(message.header, int(row["stamp"]), frame)
+    message.latitude = math.degrees(geodetic[0])
+    message.longitude = math.degrees(geodetic[1])
+    message.altitude = float(geodetic[2])
+    message.position_covariance = np.ascontiguousarray(row["pose_covariance"][:3, :3]).ravel()
+    message.position_covariance_type = NavSatFix.COVARIANCE_TYPE_KNOWN
+    return message
+
+
+def record_statuses(records: np.ndarray, stamp: Time) -> DiagnosticArray:
+    """One status per measurement: what became of it, final."""
+    message = DiagnosticArray()
+    message.header.stamp = stamp
+    for record in records:
+        verdict = Verdict(int(record["verdict"]))
+        good = verdict in (Verdict.FUSED, Verdict.DUPLICATE)
+        message.status.append(
+            DiagnosticStatus(
+                level=DiagnosticStatus.OK if good else DiagnosticStatus.WARN,
+                name=STREAM_NAMES[int(record["stream"])],
+                message=verdict.name.lower(),
+                values=key_values(
+                    {
+                        "stamp": f"{int(record['stamp']) // SECOND}.{int(record['stamp']) % SECOND:09d}",
+                        "nis": float(record["nis"]),
+                        "dof": int(record["dof"]),
+                        "innovation": " ".join(f"{value:.4f}" for value in record["innovation"]),
+                    }
+                ),
+            )
+        )
+    return message
