@@ -34,6 +34,9 @@ START_VELOCITY_STD = 100.0
 MOVING_SPEED = 0.5
 """What GNSS has to exceed by three sigma (m/s) to prove motion."""
 
+REST_TOLERANCE = 0.2
+"""Change of the mean specific force across the vertical (m/s2) that a robot at rest may show: settling springs."""
+
 STRONGEST_START = 5.0
 """No robot gathers speed faster (m/s2)."""
 
@@ -184,7 +187,7 @@ def watch_stillness(state, settings):
     duration = (state.stamp - state.window_start) * 1e-9
     if duration < settings.static_duration or state.window_count < MINIMUM_WINDOW_SAMPLES:
         return
-    still = is_still(state, settings) and state.motion_stamp < state.window_start
+    still = is_still(state, settings) and state.motion_stamp < state.window_start and is_same_rest(state)
     watch_input(state, still, settings)
     if not still:
         state.still_count = 0
@@ -270,6 +273,25 @@ def is_still(state, settings):
         if variance > limit * limit:
             return False
     return True
+
+
+@njit
+def is_same_rest(state):
+    """Say whether gravity is still where the last still window left it, as far as the gyros tell.
+
+    A steady acceleration looks like a tilt, but one that no gyro has seen.
+    """
+    if state.level_known == 0 or state.still_stamp == NEVER:
+        return True
+    n = state.window_count
+    force = (state.window_sum[0] / n, state.window_sum[1] / n, state.window_sum[2] / n)
+    force_map = rotate(to_matrix(state.attitude), force)
+    sideways = cross(local_up(state), force_map)
+    bias_variance = 0.0
+    for i in range(3):
+        bias_variance = max(bias_variance, state.covariance[GYRO_BIAS + i, GYRO_BIAS + i])
+    drift = 3.0 * math.sqrt(bias_variance) * (state.stamp - state.still_stamp) * 1e-9
+    return math.sqrt(dot(sideways, sideways)) < REST_TOLERANCE + STANDARD_GRAVITY * drift
 
 
 @njit
