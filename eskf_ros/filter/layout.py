@@ -122,8 +122,9 @@ STATE = np.dtype(
         ("still_stamp", "i8"),
         ("still_count", "i8"),
         ("still_sum", "f8", (6,)),
-        # Monitors: windows seen, and those in which the IMU cannot be what it should be.
+        # Monitors: windows seen, those at rest, and those in which the IMU cannot be what it should be.
         ("windows", "i8"),
+        ("rest_windows", "i8"),
         ("odd_gravity_windows", "i8"),
         ("odd_gravity", "f8"),
         ("tilted_windows", "i8"),

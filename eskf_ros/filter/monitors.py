@@ -35,6 +35,7 @@ def watch_input(state, still, settings):
         state.odd_gravity_windows += 1
         state.odd_gravity = strength
     elif still:
+        state.rest_windows += 1
         force_base = rotate(settings.imu_to_base, force)
         if force_base[2] < UPRIGHT_COSINE * strength:
             state.tilted_windows += 1
@@ -47,8 +48,7 @@ def watch_input(state, still, settings):
 def complaints(state: np.void) -> list[str]:
     """Say in one sentence each what is wrong with the IMU stream, and what to do; empty when nothing is."""
     found = []
-    few = max(1, int(state["windows"]) // 4)
-    if state["odd_gravity_windows"] > few:
+    if state["odd_gravity_windows"] > max(1, int(state["windows"]) // 4):
         strength = float(state["odd_gravity"])
         cause = "is its scale right?"
         if strength < 0.05 * STANDARD_GRAVITY:
@@ -56,7 +56,7 @@ def complaints(state: np.void) -> list[str]:
         elif abs(strength - 1.0) < GRAVITY_TOLERANCE:
             cause = "it is in units of g; REP-103 wants m/s2"
         found.append(f"the accelerometer reads {strength:.2f} m/s2 where gravity is {STANDARD_GRAVITY:.2f}: {cause}")
-    if state["tilted_windows"] > few:
+    if state["tilted_windows"] > max(1, int(state["rest_windows"]) // 4):
         x, y, z = (float(value) for value in state["tilted_force"])
         found.append(
             f"at rest gravity is ({x:.1f}, {y:.1f}, {z:.1f}) m/s2 in base_link, not along +z: imu.mount_rpy_deg does "
