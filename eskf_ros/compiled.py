@@ -73,8 +73,9 @@ if COMPILED:
         if CACHE_FOLDER is not None:
             numba.config.CACHE_DIR = str(CACHE_FOLDER)
         try:
-            # Fused multiply-add: quicker, and it rounds once instead of twice.
-            return numba.njit(cache=True, error_model="numpy", fastmath={"contract"})(function)
+            # No fast math: fused operations round differently wherever the compiler inlines differently, and two
+            # processes would no longer agree to the bit.
+            return numba.njit(cache=True, error_model="numpy")(function)
         finally:
             numba.config.CACHE_DIR = previous
 
