@@ -1,0 +1,224 @@
+"""Monte Carlo runs of the estimator over simulated recordings, and the statistics of their consistency.
+
+The errors of a run are those of the state of the IMU against the truth, in the order and with the conventions of the
+estimator's error state. For a consistent filter the normalised estimation error squared, e' P^-1 e (NEES), of a block
+of n errors has the chi-square distribution with n degrees of freedom at every epoch, and the normalised innovation
+squared (NIS) that of the innovation (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and
+Navigation, section 5.4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from eskf_ros.filter.layout import (
+    ACCEL_BIAS,
+    ATTITUDE,
+    ERROR_SIZE,
+    GYRO_BIAS,
+    POSITION,
+    RECORD,
+    STREAM_NAMES,
+    VELOCITY,
+    Verdict,
+)
+from eskf_ros.filter.navigator import Navigator
+from eskf_ros.parameters import Parameters, from_mapping
+from eskf_ros.simulate.imu import ImuMount
+from eskf_ros.simulate.scenario import Recording, simulate
+
+Array = NDArray[np.float64]
+
+NO_SIDE_SLIP: dict[str, Any] = {"alignment.course_std_deg": 0.1}
+"""The simulated car points where it drives: the estimator is told so, as it is told the noise of the sensors."""
+
+BLOCKS: dict[str, slice] = {
+    "position": slice(POSITION, POSITION + 3),
+    "velocity": slice(VELOCITY, VELOCITY + 3),
+    "attitude": slice(ATTITUDE, ATTITUDE + 3),
+    "accelerometer bias": slice(ACCEL_BIAS, ACCEL_BIAS + 3),
+    "gyro bias": slice(GYRO_BIAS, GYRO_BIAS + 3),
+    "all 15": slice(0, ERROR_SIZE),
+}
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run: at n epochs the errors of the state (n, 15), its covariance (n, 15, 15), and the final records.
+
+    ``seconds`` (n,) from the start of the scenario; ``aligned`` (n,): the heading was known. Everything is the state
+    as it was when the IMU sample of the epoch arrived.
+    """
+
+    seconds: Array
+    aligned: NDArray[np.bool_]
+    error: Array
+    covariance: Array
+    records: np.ndarray
+
+
+@dataclass(frozen=True)
+class Ensemble:
+    """Runs of one scenario that differ in the seed only, cut to the epochs at which all are aligned.
+
+    ``error`` (runs, epochs, 15) and ``covariance`` (runs, epochs, 15, 15) as in `Run`. ``nis`` by stream: NIS of all
+    measurements offered since then, whatever became of them; ``gated``: the share of them that was outside the gate.
+    """
+
+    seconds: Array
+    error: Array
+    covariance: Array
+    nis: dict[str, Array]
+    gated: dict[str, float]
+
+    @cached_property
+    def nees(self) -> dict[str, Array]:
+        """NEES by block, (runs, epochs) each."""
+        return {name: nees(self.error, self.covariance, block) for name, block in BLOCKS.items()}
+
+
+def feed(recording: Recording, navigator: Navigator, stops: NDArray[np.int64]) -> Iterable[tuple[int, np.ndarray]]:
+    """Run a recording through a navigator; yield (i, state) right after each of its IMU samples ``stops`` (indices).
+
+    The state at a stop has seen what had arrived by then. In between, messages are handed over in bulk: the order
+    makes no difference to the state (principle of the timeline) but to the time it takes.
+    """
+    fix = velocity = sample = 0
+    for i in stops:
+        now = recording.imu_arrival[i]
+        while fix < len(recording.fix_stamp) and recording.fix_arrival[fix] <= now:
+            navigator.push_gnss_position(
+                int(recording.fix_stamp[fix]),
+                float(recording.fix_latitude_deg[fix]),
+                float(recording.fix_longitude_deg[fix]),
+                float(recording.fix_altitude[fix]),
+                recording.fix_covariance[fix],
+                covariance_type=3,
+                status=0,
+                arrival=int(recording.fix_arrival[fix]),
+            )
+            fix += 1
+        while velocity < len(recording.velocity_stamp) and recording.velocity_arrival[velocity] <= now:
+            navigator.push_gnss_velocity(
+                int(recording.velocity_stamp[velocity]),
+                recording.velocity_enu[velocity],
+                recording.velocity_covariance[velocity],
+                int(recording.velocity_arrival[velocity]),
+            )
+            velocity += 1
+        part = slice(sample, i + 1)
+        navigator.push_imu(recording.imu_stamp[part], recording.specific_force[part], recording.angular_rate[part])
+        sample = i + 1
+        yield int(i), navigator.state[0]
+
+
+def state_error(recording: Recording, i: int, truth: int, state: np.void) -> Array:
+    """Return the error (15,), truth minus estimate, of ``state`` at IMU sample ``i`` and truth sample ``truth``."""
+    mount = ImuMount(recording.options.imu_position, recording.options.imu_rpy_deg)
+    body_to_map = Rotation.from_quat(np.roll(recording.truth_attitude_body_to_map[truth], -1))
+    sway_body = np.cross(recording.truth_angular_rate_body[truth], mount.position)
+    position = recording.truth_position_map[truth] + body_to_map.apply(mount.position)
+    velocity = recording.truth_velocity_map[truth] + body_to_map.apply(sway_body)
+    imu_to_map = body_to_map * Rotation.from_matrix(mount.rotation_imu_to_body)
+    turn = imu_to_map * Rotation.from_quat(np.roll(state["attitude"], -1)).inv()
+    return np.concatenate(
+        [
+            position - state["position_map"],
+            velocity - state["velocity_map"],
+            turn.as_rotvec(),
+            recording.accel_bias[i] - state["accel_bias"],
+            recording.gyro_bias[i] - state["gyro_bias"],
+        ]
+    )
+
+
+def run(recording: Recording, navigator: Navigator, interval: float = 0.5) -> Run:
+    """Run one recording and compare with the truth every ``interval`` s, a multiple of that of the truth."""
+    every = round(interval * recording.options.imu_rate)
+    stops = np.arange(every - 1, len(recording.imu_stamp), every)
+    truth = np.searchsorted(recording.truth_stamp, recording.imu_stamp[stops])
+    if np.any(recording.truth_stamp[truth] != recording.imu_stamp[stops]):
+        raise ValueError(f"no truth every {interval:g} s in recording {recording.name}")
+    records, errors, covariances, aligned = [], [], [], []
+    for k, (i, state) in enumerate(feed(recording, navigator, stops)):
+        records.append(navigator.take_records())
+        aligned.append(bool(state["heading_known"]))
+        errors.append(state_error(recording, i, truth[k], state))
+        covariances.append(state["covariance"])
+    records.append(navigator.finish())
+    return Run(
+        seconds=(stops + 1) / recording.options.imu_rate,
+        aligned=np.array(aligned),
+        error=np.array(errors),
+        covariance=np.array(covariances),
+        records=np.concatenate(records, dtype=RECORD),
+    )
+
+
+def nees(error: Array, covariance: Array, block: slice) -> Array:
+    """Return e' P^-1 e of a block of errors; ``error`` (..., 15), ``covariance`` (..., 15, 15)."""
+    part = error[..., block]
+    return np.einsum("...i,...i->...", part, np.linalg.solve(covariance[..., block, block], part[..., None])[..., 0])
+
+
+def ensemble(
+    name: str,
+    seeds: Iterable[int],
+    changes: dict[str, Any] | None = None,
+    interval: float = 0.5,
+    progress: Callable[[int], None] = lambda done: None,
+    **options: Any,
+) -> Ensemble:
+    """Simulate and run scenario ``name`` for all ``seeds``.
+
+    ``options`` are those of the simulation; ``changes`` are parameters of the estimator by dotted name, on top of those
+    that describe the simulation. ``progress`` is called with the number of runs done.
+    """
+    seeds = list(seeds)
+    runs = []
+    for seed in seeds:
+        recording = simulate(name, seed, **options)
+        parameters: Parameters = from_mapping({**recording.parameters(), **NO_SIDE_SLIP, **(changes or {})})
+        runs.append(run(recording, Navigator(parameters), interval))
+        progress(len(runs))
+    # From the moment on at which the last of the runs is aligned.
+    for seed, r in zip(seeds, runs):
+        if not r.aligned.any():
+            raise ValueError(f"{name} with seed {seed}: the heading never became known")
+    first = max(int(np.argmax(r.aligned)) for r in runs)
+    start_stamp = recording.imu_stamp[0] + round((runs[0].seconds[first] - 1.0 / recording.options.imu_rate) * 1e9)
+    nis, gated = {}, {}
+    for stream, stream_name in enumerate(STREAM_NAMES):
+        of_stream = [r.records[(r.records["stream"] == stream) & (r.records["stamp"] > start_stamp)] for r in runs]
+        offered = np.concatenate([records[records["dof"] > 0] for records in of_stream])
+        if len(offered):
+            nis[stream_name] = offered["nis"]
+            gated[stream_name] = float(np.mean(offered["verdict"] != Verdict.FUSED))
+    return Ensemble(
+        seconds=runs[0].seconds[first:],
+        error=np.array([r.error[first:] for r in runs]),
+        covariance=np.array([r.covariance[first:] for r in runs]),
+        nis=nis,
+        gated=gated,
+    )
+
+
+def mean_band(degrees: int, count: int, probability: float = 0.95) -> tuple[float, float]:
+    """Return the central band of the mean of ``count`` independent chi-square variables with ``degrees`` each."""
+    low, high = chi2.ppf([0.5 - probability / 2.0, 0.5 + probability / 2.0], degrees * count) / count
+    return float(low), float(high)
+
+
+def share_in_band(nees_of_runs: Array, degrees: int) -> float:
+    """Return the share of epochs at which the mean over the runs (runs, epochs) lies in its 95 % band."""
+    low, high = mean_band(degrees, len(nees_of_runs))
+    mean = nees_of_runs.mean(axis=0)
+    return float(np.mean((mean > low) & (mean < high)))
