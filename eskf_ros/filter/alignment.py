@@ -365,7 +365,8 @@ def set_gyro_bias(state, mean_rate, rotation, up, duration, still, settings):
     horizontal_square = dot(earth, earth) - vertical_rate**2
     known = (vertical_rate * up[0], vertical_rate * up[1], vertical_rate * up[2])
     vertical_variance = noise
-    horizontal_variance = noise + horizontal_square
+    # Of unknown direction: half of its square falls on each horizontal axis.
+    horizontal_variance = noise + 0.5 * horizontal_square
     if state.datum_known == 0:
         vertical_variance = noise + EARTH_RATE**2
         horizontal_variance = noise + EARTH_RATE**2
