@@ -28,7 +28,10 @@ TYPES = {
 }
 SECONDS = 32.0
 SPEED = 4.0
-RELIABLE = ("-p", "qos_overrides./imu/data.subscription.reliability:=reliable")
+RELIABLE = tuple(
+    word for topic in TYPES for word in ("-p", f"qos_overrides./{topic}.subscription.reliability:=reliable")
+)
+"""For the comparison to the bit no message may get lost on a busy machine."""
 
 
 @pytest.fixture
