@@ -1,9 +1,9 @@
 """Is the filter as wrong as it says? Writes the figures of docs/consistency.md and draws docs/consistency.png.
 
-    python benchmark/consistency.py [--runs 100] [--sets 5] [--variant-runs 100]
+    python benchmark/consistency.py [--runs 100] [--sets 10] [--variant-runs 100]
 
 Simulates `sets` times `runs` drives of each scenario, and `variant-runs` of each variant, runs the estimator over them
-and compares its errors with its covariance. About seven minutes on one core. The exit code is 1 if a bar is missed.
+and compares its errors with its covariance. About ten minutes on one core. The exit code is 1 if a bar is missed.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ def main() -> int:
     assert __doc__ is not None
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=100, help="runs in a set, whose mean NEES is judged per epoch")
-    parser.add_argument("--sets", type=int, default=5, help="disjoint sets of seeds")
+    parser.add_argument("--sets", type=int, default=10, help="disjoint sets of seeds")
     parser.add_argument("--variant-runs", type=int, default=100, help="runs of each variant; 0 leaves them out")
     arguments = parser.parse_args()
     begin = time.perf_counter()
