@@ -176,8 +176,12 @@ def test_the_node_says_what_it_waits_for(ros):
 
 
 def test_hostile_messages_leave_the_node_alive(ros, drive):
-    """Random bytes, NaN, zero stamps: the node goes on, and then follows good data."""
-    node = start_node(ros, "--params-file", str(CONFIG), *RELIABLE)
+    """Random bytes, NaN, zero stamps: the node goes on, and then follows good data.
+
+    On best-effort subscriptions, as they are by default: a reliable one waits for ever for a message of three bytes,
+    which DDS itself refuses again and again.
+    """
+    node = start_node(ros, "--params-file", str(CONFIG))
     robot = Robot(ros)
     robot.wait_for_node()
     random = np.random.default_rng(1)
@@ -195,7 +199,7 @@ def test_hostile_messages_leave_the_node_alive(ros, drive):
             good[-72:] = np.full(9, np.nan).tobytes()
         robot.publishers[topic].publish(bytes(good))
         ros.spin_once(0.001)
-    robot.play(drive[: len(drive) // 3], speed=8.0)
+    robot.play(drive[: len(drive) // 2], speed=5.0)
     ros.until(lambda: robot.odometry["odometry/global"], what="odometry after hostile messages")
     for message in robot.odometry["odometry/local"] + robot.odometry["odometry/global"]:
         assert np.all(np.isfinite(message.pose.covariance))

@@ -80,20 +80,16 @@ class EskfNode(Node):
         for qos in (imu_qos, gnss_qos):
             qos.durability = DurabilityPolicy.VOLATILE
         overriding = QoSOverridingOptions.with_default_policies()
+        # All come serialised: a message that cannot be read fails in our callback, not in the executor.
         self.inputs = [
             self.create_subscription(
-                Imu, topics.imu, self._contained(self._on_imu), imu_qos, raw=True, qos_overriding_options=overriding
-            ),
-            self.create_subscription(
-                NavSatFix, topics.gnss_fix, self._contained(self._on_fix), gnss_qos, qos_overriding_options=overriding
-            ),
-            self.create_subscription(
-                TwistWithCovarianceStamped,
-                topics.gnss_velocity,
-                self._contained(self._on_velocity),
-                gnss_qos,
-                qos_overriding_options=overriding,
-            ),
+                kind, topic, self._contained(callback), qos, raw=True, qos_overriding_options=overriding
+            )
+            for kind, topic, callback, qos in (
+                (Imu, topics.imu, self._on_imu, imu_qos),
+                (NavSatFix, topics.gnss_fix, self._on_fix, gnss_qos),
+                (TwistWithCovarianceStamped, topics.gnss_velocity, self._on_velocity, gnss_qos),
+            )
         ]
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/set_datum_here", self._on_set_datum_here)
@@ -173,7 +169,8 @@ class EskfNode(Node):
         for row in rows:
             self._publish(row)
 
-    def _on_fix(self, message: NavSatFix) -> None:
+    def _on_fix(self, data: bytes) -> None:
+        message: NavSatFix = deserialize_message(data, NavSatFix)
         stamp = message.header.stamp.sec * SECOND + message.header.stamp.nanosec
         if self._is_usable(self.parameters.topics.gnss_fix, stamp):
             self.navigator.push_gnss_position(
@@ -187,7 +184,8 @@ class EskfNode(Node):
                 self._now(),
             )
 
-    def _on_velocity(self, message: TwistWithCovarianceStamped) -> None:
+    def _on_velocity(self, data: bytes) -> None:
+        message: TwistWithCovarianceStamped = deserialize_message(data, TwistWithCovarianceStamped)
         stamp = message.header.stamp.sec * SECOND + message.header.stamp.nanosec
         if self._is_usable(self.parameters.topics.gnss_velocity, stamp):
             linear = message.twist.twist.linear
