@@ -19,27 +19,33 @@ def driven(request) -> tuple[Recording, np.ndarray]:
     apart = {"imu_position": (0.5, -0.3, 0.8), "imu_rpy_deg": (0.0, 0.0, 90.0)} if "apart" in request.param else {}
     recording = simulate("drive", seed=4, imu_rate=100.0, start=10.0, stop=70.0, position_std=(3.0, 5.0), **apart)
     navigator = Navigator(from_mapping(recording.parameters()))
-    rows, first = [], 0
+    rows = []
     for epoch, arrival in enumerate(recording.fix_arrival):
-        last = int(np.searchsorted(recording.imu_arrival, arrival))
-        part = slice(first, last)
-        rows.append(
-            navigator.push_imu(recording.imu_stamp[part], recording.specific_force[part], recording.angular_rate[part])
-        )
-        first = last
-        navigator.push_gnss_position(
-            int(recording.fix_stamp[epoch]),
-            float(recording.fix_latitude_deg[epoch]),
-            float(recording.fix_longitude_deg[epoch]),
-            float(recording.fix_altitude[epoch]),
-            recording.fix_covariance[epoch],
-            2,
-            0,
-        )
-        navigator.push_gnss_velocity(
-            int(recording.velocity_stamp[epoch]), recording.velocity_enu[epoch], recording.velocity_covariance[epoch]
-        )
+        rows.append(give_imu(navigator, recording, arrival))
+        give_fix(navigator, recording, epoch)
     return recording, np.concatenate(rows)
+
+
+def give_imu(navigator: Navigator, recording: Recording, until: int) -> np.ndarray:
+    """Push the IMU samples newer than those the navigator has, up to ``until`` (ns)."""
+    part = (recording.imu_stamp > navigator.state["imu_stamp"][0]) & (recording.imu_stamp <= until)
+    return navigator.push_imu(recording.imu_stamp[part], recording.specific_force[part], recording.angular_rate[part])
+
+
+def give_fix(navigator: Navigator, recording: Recording, epoch: int) -> None:
+    """Push position and velocity of one GNSS epoch."""
+    navigator.push_gnss_position(
+        int(recording.fix_stamp[epoch]),
+        float(recording.fix_latitude_deg[epoch]),
+        float(recording.fix_longitude_deg[epoch]),
+        float(recording.fix_altitude[epoch]),
+        recording.fix_covariance[epoch],
+        2,
+        0,
+    )
+    navigator.push_gnss_velocity(
+        int(recording.velocity_stamp[epoch]), recording.velocity_enu[epoch], recording.velocity_covariance[epoch]
+    )
 
 
 def heading(quaternion: np.ndarray) -> np.ndarray:
@@ -93,3 +99,20 @@ def test_the_local_pose_drifts_no_more_than_its_covariance_says(driven):
     assert abs(np.linalg.norm(moved) - np.linalg.norm(true)) < 3.0 * sigma
     assert np.all(np.diff(rows["local_position_variance"]) >= 0.0)
     assert np.all(np.diff(rows["local_heading_variance"]) >= 0.0)
+
+
+def test_a_new_datum_moves_the_map_and_not_the_local_pose(driven):
+    recording, _ = driven
+    navigator = Navigator(from_mapping(recording.parameters()))
+    half = len(recording.imu_stamp) // 2
+    rows = []
+    for epoch, stamp in enumerate(recording.fix_stamp[recording.fix_stamp < recording.imu_stamp[half]]):
+        rows.append(give_imu(navigator, recording, stamp))
+        give_fix(navigator, recording, epoch)
+    assert navigator.set_datum_here()
+    rows.append(give_imu(navigator, recording, recording.imu_stamp[half]))
+    around = np.concatenate(rows)[-50:]
+    assert np.linalg.norm(around["position_map"][-1] - around["position_map"][0]) > 50.0
+    assert np.abs(steps_of(around["position_odom"], around)).max() < 0.03
+    turn = np.diff(heading(around["attitude_body_to_odom"]))
+    assert np.abs(turn - around["angular_rate_body"][1:, 2] * np.diff(around["stamp"]) * 1e-9).max() < 0.01

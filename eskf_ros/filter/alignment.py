@@ -26,6 +26,7 @@ from eskf_ros.rotation import (
     rotate,
     rotate_back,
     to_matrix,
+    to_rotation_vector,
     wrapped,
 )
 
@@ -68,42 +69,6 @@ def set_datum(state, latitude, longitude, altitude):
 
 
 @njit
-def move_datum(state, latitude, longitude, altitude):
-    """Describe the same state in the local frame of another datum (rad, rad, m): an exact rotation and shift."""
-    old = state.map_to_ecef
-    old_rows = ((old[0, 0], old[0, 1], old[0, 2]), (old[1, 0], old[1, 1], old[1, 2]), (old[2, 0], old[2, 1], old[2, 2]))
-    offset = rotate(old_rows, state.position_map)
-    ecef = (
-        state.origin_ecef[0] + offset[0],
-        state.origin_ecef[1] + offset[1],
-        state.origin_ecef[2] + offset[2],
-    )
-    set_datum(state, latitude, longitude, altitude)
-    origin = state.origin_ecef
-    position = rotate_back(state.map_to_ecef, (ecef[0] - origin[0], ecef[1] - origin[1], ecef[2] - origin[2]))
-    velocity = rotate_back(state.map_to_ecef, rotate(old_rows, state.velocity_map))
-    columns = (
-        rotate_back(state.map_to_ecef, (old_rows[0][0], old_rows[1][0], old_rows[2][0])),
-        rotate_back(state.map_to_ecef, (old_rows[0][1], old_rows[1][1], old_rows[2][1])),
-        rotate_back(state.map_to_ecef, (old_rows[0][2], old_rows[1][2], old_rows[2][2])),
-    )
-    turn = (
-        (columns[0][0], columns[1][0], columns[2][0]),
-        (columns[0][1], columns[1][1], columns[2][1]),
-        (columns[0][2], columns[1][2], columns[2][2]),
-    )
-    attitude = (state.attitude[0], state.attitude[1], state.attitude[2], state.attitude[3])
-    attitude = normalized(multiply(from_matrix(turn), attitude))
-    for i in range(4):
-        state.attitude[i] = attitude[i]
-    for i in range(3):
-        state.position_map[i] = position[i]
-        state.velocity_map[i] = velocity[i]
-    for block in (POSITION, VELOCITY, ATTITUDE):
-        transform_error(state.covariance, block, turn)
-
-
-@njit
 def local_up(state):
     """Return the unit vector against gravity (map axes) at the current position."""
     gravity = gravity_map(state, (state.position_map[0], state.position_map[1], state.position_map[2]))
@@ -120,6 +85,29 @@ def turn_attitude(state, rotation_vector):
     for i in range(4):
         state.attitude[i] = attitude[i]
     transform_error(state.covariance, ATTITUDE, to_matrix(turn))
+
+
+@njit
+def move_datum(state, latitude, longitude, altitude):
+    """Describe the same state in the local frame of another datum (rad, rad, m): an exact rotation and shift."""
+    old = east_north_up_to_ecef(state.datum[0], state.datum[1])
+    offset = rotate(old, state.position_map)
+    ecef = (state.origin_ecef[0] + offset[0], state.origin_ecef[1] + offset[1], state.origin_ecef[2] + offset[2])
+    set_datum(state, latitude, longitude, altitude)
+    origin = state.origin_ecef
+    # Columns of the rotation from old to new map, as rows: the images of the old axes.
+    east = rotate_back(state.map_to_ecef, (old[0][0], old[1][0], old[2][0]))
+    north = rotate_back(state.map_to_ecef, (old[0][1], old[1][1], old[2][1]))
+    up = rotate_back(state.map_to_ecef, (old[0][2], old[1][2], old[2][2]))
+    turn = ((east[0], north[0], up[0]), (east[1], north[1], up[1]), (east[2], north[2], up[2]))
+    position = rotate_back(state.map_to_ecef, (ecef[0] - origin[0], ecef[1] - origin[1], ecef[2] - origin[2]))
+    velocity = rotate(turn, state.velocity_map)
+    for i in range(3):
+        state.position_map[i] = position[i]
+        state.velocity_map[i] = velocity[i]
+    transform_error(state.covariance, POSITION, turn)
+    transform_error(state.covariance, VELOCITY, turn)
+    turn_attitude(state, to_rotation_vector(from_matrix(turn)))
 
 
 @njit

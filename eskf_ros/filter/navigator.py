@@ -258,12 +258,14 @@ class Navigator:
         A barrier: what came before is final, and nothing older is accepted afterwards.
         """
         self.update()
-        state = self._states[0]
+        state, settings = self._states[0], self._settings[0]
         if not state["position_known"]:
             return False
         ecef = state["origin_ecef"] + state["map_to_ecef"] @ state["position_map"]
+        position, heading = tuple(state["position_map"]), heading_of(state, settings)
         self._refused.insert(0, self._take_records(True))
         move_datum(state, *ecef_to_geodetic(*ecef))
+        note_jump(state, position, heading, settings)
         raise_barrier(self._states, self._blank, self._timeline)
         return True
 
