@@ -84,3 +84,39 @@ def test_plain_kernels_agree_with_the_compiled_ones(tmp_path: Path) -> None:
 
 if __name__ == "__main__":
     drive(Path(sys.argv[1]))
+
+
+@pytest.mark.skipif(not COMPILED, reason="without numba nothing is compiled")
+def test_nothing_is_left_to_compile_once_the_kernels_are() -> None:
+    """A kernel that compiles in a callback stops the robot's odometry for seconds.
+
+    In a process of its own: whatever another test has compiled would hide what is missing here.
+    """
+    code = """
+import numba, numpy as np
+from eskf_ros.filter import navigator
+from eskf_ros.parameters import from_mapping
+from eskf_ros.simulate.scenario import simulate
+
+navigator.compile_kernels()
+found = vars(navigator).items()
+compiled = lambda: {n: len(f.signatures) for n, f in found if isinstance(f, numba.core.dispatcher.Dispatcher)}
+before = compiled()
+recording = simulate("drive", imu_rate=100.0, start=12.0, stop=62.0)
+pilot = navigator.Navigator(from_mapping(recording.parameters()))
+for epoch, stamp in enumerate(recording.fix_stamp):
+    part = (recording.imu_stamp <= stamp) & (recording.imu_stamp > pilot.state["imu_stamp"][0])
+    pilot.push_imu(recording.imu_stamp[part], recording.specific_force[part], recording.angular_rate[part])
+    pilot.push_gnss_position(int(stamp), *(float(v) for v in (recording.fix_latitude_deg[epoch],
+        recording.fix_longitude_deg[epoch], recording.fix_altitude[epoch])), recording.fix_covariance[epoch], 2, 0)
+    pilot.push_gnss_velocity(int(stamp), recording.velocity_enu[epoch], recording.velocity_covariance[epoch])
+    pilot.take_records()
+assert pilot.set_datum_here() and pilot.odometry["heading_known"][0] and pilot.status >= 0
+pilot.finish()
+after = compiled()
+assert len(before) > 5
+print([name for name in after if after[name] != before[name]])
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.strip() == "[]"

@@ -477,6 +477,11 @@ class Navigator:
         refused, self._refused = self._refused, []
         return np.concatenate([np.array(records[:count], RECORD), *refused])
 
+    def _forget(self) -> None:
+        """Drop what no message in time can reach any more."""
+        self.update()
+        forget(self._states, self._imu, self._aids, self._checkpoints, self._timeline)
+
     def _make_room(self) -> None:
         """See that one batch of IMU samples with its checkpoints, and one aid, fit into the buffers."""
         timeline = self._timeline
@@ -487,8 +492,7 @@ class Navigator:
             and len(self._checkpoints) >= timeline["checkpoint_count"][0] + checkpoints_needed
         ):
             return
-        self.update()
-        forget(self._states, self._imu, self._aids, self._checkpoints, timeline)
+        self._forget()
         while len(self._imu) < 2 * (timeline["imu_count"][0] + IMU_BATCH):
             self._imu = doubled(self._imu)
             self._rows = doubled(self._rows)
@@ -496,6 +500,22 @@ class Navigator:
             self._aids = doubled(self._aids)
         while len(self._checkpoints) < 2 * (timeline["checkpoint_count"][0] + checkpoints_needed):
             self._checkpoints = doubled(self._checkpoints)
+
+
+def compile_kernels() -> None:
+    """Compile all that a `Navigator` calls, or load it from the cache: nothing of it is left for a callback."""
+    trial = Navigator(Parameters())
+    stamp, point, unit = SECOND, (0.0, 0.0, 0.0), np.eye(3).ravel()
+    trial.push_imu(np.array([stamp]), np.array([[0.0, 0.0, 9.8]]), np.zeros((1, 3)))
+    trial.push_gnss_position(stamp, *point, unit, 2, 0)
+    trial.push_gnss_velocity(stamp, point, unit)
+    trial.take_records()
+    trial.odometry  # noqa: B018 - asked for its side effect
+    trial.status  # noqa: B018
+    trial._forget()
+    # Known by decree: the one method that asks for a position first.
+    trial._states["position_known"] = 1
+    trial.set_datum_here()
 
 
 def _copied(records: np.ndarray, count: int) -> np.ndarray:

@@ -17,7 +17,7 @@ from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
 
 from eskf_ros.filter.layout import Verdict
-from eskf_ros.filter.navigator import Navigator
+from eskf_ros.filter.navigator import Navigator, compile_kernels
 from eskf_ros.node.cdr import (
     AnyOdometryWriter,
     ImuReader,
@@ -103,13 +103,7 @@ class EskfNode(Node):
     def _compile(self) -> None:
         """Have every kernel compiled before the first message comes: from the cache, or anew for half a minute."""
         self.get_logger().info("starting the estimator; the first start after an installation compiles it (a minute)")
-        trial = Navigator(Parameters())
-        trial.push_imu(np.array([SECOND]), np.array([[0.0, 0.0, 9.8]]), np.zeros((1, 3)))
-        trial.push_gnss_position(SECOND, 0.0, 0.0, 0.0, np.eye(3).ravel(), 2, 0)
-        trial.push_gnss_velocity(SECOND, (0.0, 0.0, 0.0), np.eye(3).ravel())
-        trial.update()
-        trial.take_records()
-        trial.odometry  # noqa: B018 - compiles the output
+        compile_kernels()
 
     def _writer(self, frame: str, child_frame: str) -> AnyOdometryWriter:
         try:
