@@ -3,8 +3,8 @@
 The dataclasses below are the only place where a parameter is defined. `config/eskf.yaml` and `docs/parameters.md`
 are written from them by `python -m eskf_ros.parameters`, and `load` reads the ROS 2 parameter files users write.
 
-Values are Python floats, bools, strings and tuples of floats. Angles whose name ends in `_deg` are degrees, all
-others are in the SI unit stated with them. This module imports neither numpy nor ROS, so that reading a
+Values are Python floats, integers, bools, strings and tuples of floats. Angles whose name ends in `_deg` are degrees,
+all others are in the SI unit stated with them. This module imports neither numpy nor ROS, so that reading a
 configuration costs no start-up time.
 """
 
@@ -23,7 +23,7 @@ from typing import Any
 
 import yaml
 
-Value = float | bool | str | tuple[float, ...]
+Value = float | int | bool | str | tuple[float, ...]
 
 
 class ParameterError(ValueError):
@@ -67,6 +67,11 @@ def _group(group: type, description: str) -> Any:
     return dataclasses.field(default_factory=group, metadata={"group": group, "description": description})
 
 
+def _choice(default: str, description: str, *others: str) -> Any:
+    words = (default, *others)
+    return _parameter(default, "", description, pattern="|".join(words), pattern_text=" or ".join(words))
+
+
 _FRAME = {"pattern": r"[^/\s]\S*", "pattern_text": "a frame name without blanks and without a leading slash"}
 _TOPIC = {
     "pattern": r"(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*",
@@ -82,6 +87,14 @@ class Frames:
     odom: str = _parameter("odom", "", "Frame of the local estimate, which never jumps (REP-105).", **_FRAME)
     base_link: str = _parameter(
         "base_link", "", "Frame of the vehicle whose pose is estimated: x forward, y left, z up (REP-103).", **_FRAME
+    )
+    extrinsics: str = _choice(
+        "auto",
+        "Where the node takes the places of the sensors in base_link from. auto: those that are not given as "
+        "parameters (imu.mount_position, imu.mount_rpy_deg, gnss.lever_arm) come from /tf_static by the "
+        "header.frame_id of the messages, if they are known there. parameters: /tf_static is not looked at; so it is "
+        "in the replay.",
+        "parameters",
     )
 
 
@@ -353,6 +366,60 @@ class Alignment:
 
 
 @dataclass(frozen=True)
+class WarmStart:
+    file: str = _parameter(
+        "",
+        "",
+        "File in which the node keeps biases, position and heading from one run to the next: written at shutdown, read "
+        "at start. Empty: none.",
+        pattern=r"[^\0]*",
+        pattern_text="a path, or nothing",
+    )
+    max_age: float = _parameter(
+        86400.0,
+        "s",
+        "A file older than this is not used. Age is counted in stamps of the IMU.",
+        above=0.0,
+        maximum=1.0e9,
+    )
+    heading_std_deg: float = _parameter(
+        2.0,
+        "deg",
+        "Standard deviation of the heading that a vehicle parked in between is given at least.",
+        above=0.0,
+        maximum=180.0,
+    )
+    position_tolerance: float = _parameter(
+        3.0,
+        "m",
+        "The first fix may be this far, plus three of its own standard deviations, from where the vehicle was left; "
+        "otherwise it was moved, and its old heading is not used.",
+        above=0.0,
+        maximum=1.0e4,
+    )
+
+
+@dataclass(frozen=True)
+class Output:
+    tf: str = _choice(
+        "full",
+        "Transforms the node publishes on /tf. full: map -> odom -> base_link. map_to_odom: only map -> odom; another "
+        "node owns odom -> base_link, which is read from /tf. none: none.",
+        "map_to_odom",
+        "none",
+    )
+    rate_divisor: int = _parameter(
+        1, "", "Odometry and transforms are published for every so many IMU samples.", minimum=1, maximum=1000
+    )
+    two_d: bool = _parameter(
+        False,
+        "",
+        "For planar robots: publish z, roll and pitch as zero, and no vertical velocity and no roll and pitch rate. "
+        "The estimator works in three dimensions all the same.",
+    )
+
+
+@dataclass(frozen=True)
 class Parameters:
     """Every parameter; `Parameters()` holds the defaults, `dataclasses.replace` changes a copy."""
 
@@ -371,6 +438,8 @@ class Parameters:
     gnss: Gnss = _group(Gnss, "The GNSS receiver: where its antenna sits and how far its messages are trusted.")
     history: History = _group(History, "Late and out-of-order messages.")
     alignment: Alignment = _group(Alignment, "Start-up: levelling, heading, and when the estimate is called good.")
+    warm_start: WarmStart = _group(WarmStart, "What the node remembers of its last run.")
+    output: Output = _group(Output, "What the node publishes, and how.")
 
 
 @dataclass(frozen=True)
@@ -386,8 +455,9 @@ class Leaf:
 
     @property
     def kind(self) -> str:
-        """float, bool, string or float list."""
-        return {bool: "bool", str: "string", tuple: "float list"}.get(type(self.default), "float")
+        """float, integer, bool, string or float list."""
+        kinds = {bool: "bool", int: "integer", str: "string", tuple: "float list"}
+        return kinds.get(type(self.default), "float")
 
     def allowed(self) -> str:
         """What may be written for this parameter, as it appears in errors and in the documentation."""
@@ -407,10 +477,11 @@ class Leaf:
         if self.kind == "float list":
             counts = " or ".join("no" if count == 0 else str(count) for count in rule.lengths)
             return f"{counts} numbers, {'in turn' if isinstance(rule.minimum, tuple) else 'each'} {bounds}"
-        return f"a number {bounds}{' or .nan' if rule.nan_allowed else ''}"
+        noun = "a whole number" if self.kind == "integer" else "a number"
+        return f"{noun} {bounds}{' or .nan' if rule.nan_allowed else ''}"
 
     def convert(self, value: object) -> Value:
-        """The checked value in the type of this parameter; integers become floats.
+        """The checked value in the type of this parameter; integers become floats where a float is wanted.
 
         Raises ValueError naming the key, the value and what is allowed.
         """
@@ -426,6 +497,8 @@ class Leaf:
             return value if isinstance(value, bool) else None
         if self.kind == "string":
             return value if isinstance(value, str) and re.fullmatch(self.rule.pattern, value) else None
+        if self.kind == "integer":
+            return value if isinstance(value, int) and self._number(value, 0) is not None else None
         if self.kind == "float":
             return self._number(value, 0)
         # numpy arrays and array.array (what rclpy hands out) are lists here too.
@@ -671,6 +744,8 @@ def _yaml_value(value: Value) -> str:
         return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
     if isinstance(value, tuple):
         return f"[{', '.join(_yaml_value(element) for element in value)}]"
+    if isinstance(value, int):
+        return str(value)
     if math.isnan(value):
         return ".nan"
     mantissa, exponent_sign, exponent = repr(value).partition("e")

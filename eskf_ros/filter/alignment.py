@@ -16,6 +16,7 @@ from eskf_ros.filter.covariance import transform_error
 from eskf_ros.filter.layout import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, NEVER, POSITION, VELOCITY
 from eskf_ros.filter.monitors import watch_input
 from eskf_ros.filter.strapdown import gravity_map
+from eskf_ros.filter.warm_start import do_biases_hold
 from eskf_ros.rotation import (
     cross,
     dot,
@@ -290,6 +291,17 @@ def level(state, sums, count, interval, still, settings):
     tilts the result, theta = up x (R dba) / g: the cross covariance says so (Groves, section 5.6.2).
     """
     force = (sums[0] / count, sums[1] / count, sums[2] / count)
+    rate = (sums[3] / count, sums[4] / count, sums[5] / count)
+    bias = (0.0, 0.0, 0.0)
+    accel_bias_variance = settings.accel_bias_std**2
+    start_rate = (0.0, 0.0, 0.0)
+    gyro_bias_variance = settings.gyro_bias_std**2
+    if do_biases_hold(state, force, rate, count * interval, still, settings):
+        b, r = settings.remembered_accel_bias, settings.remembered_gyro_bias
+        bias, start_rate = (b[0], b[1], b[2]), (r[0], r[1], r[2])
+        accel_bias_variance = settings.remembered_accel_bias_std**2
+        gyro_bias_variance = settings.remembered_gyro_bias_std**2
+    force = (force[0] - bias[0], force[1] - bias[1], force[2] - bias[2])
     strength = math.sqrt(dot(force, force))
     if strength < 0.5 * STANDARD_GRAVITY:
         return
@@ -304,7 +316,6 @@ def level(state, sums, count, interval, still, settings):
         for j in range(ERROR_SIZE):
             covariance[i, j] = 0.0
             covariance[j, i] = 0.0
-    accel_bias_variance = settings.accel_bias_std**2
     if still:
         tilt_noise = settings.accel_noise_density**2 / (count * interval) / strength**2
     else:
@@ -314,7 +325,7 @@ def level(state, sums, count, interval, still, settings):
     if state.heading_known == 1:
         heading_variance = settings.initial_heading_std**2
     for i in range(3):
-        state.accel_bias[i] = 0.0
+        state.accel_bias[i] = bias[i]
         covariance[ACCEL_BIAS + i, ACCEL_BIAS + i] = accel_bias_variance
         # Column i of [up]x R / g.
         tilt = cross(up, (rotation[0][i], rotation[1][i], rotation[2][i]))
@@ -328,9 +339,7 @@ def level(state, sums, count, interval, still, settings):
             covariance[ATTITUDE + i, ATTITUDE + j] = (
                 horizontal * (accel_bias_variance / strength**2 + tilt_noise) + up[i] * up[j] * heading_variance
             )
-    set_gyro_bias(
-        state, (sums[3] / count, sums[4] / count, sums[5] / count), rotation, up, count * interval, still, settings
-    )
+    set_gyro_bias(state, start_rate, gyro_bias_variance, rate, rotation, up, count * interval, still, settings)
     # The parameter is true of the start only, not of where a restart finds the robot.
     if state.level_known == 0 and state.restarts == 0 and not math.isnan(settings.initial_heading):
         state.heading_known = 1
@@ -340,13 +349,12 @@ def level(state, sums, count, interval, still, settings):
 
 
 @njit
-def set_gyro_bias(state, mean_rate, rotation, up, duration, still, settings):
+def set_gyro_bias(state, prior_bias, prior, mean_rate, rotation, up, duration, still, settings):
     """Estimate the gyro bias from the mean rate at rest; what is not known of the Earth rate enters its sigma.
 
-    The prior (zero, ``gyro_bias_std``) and the mean are weighed along the vertical and across it, because without
-    heading only the vertical part of the Earth rate is known.
+    The prior (``prior_bias``, rad/s, IMU axes, with variance ``prior``) and the mean are weighed along the vertical
+    and across it, because without heading only the vertical part of the Earth rate is known.
     """
-    prior = settings.gyro_bias_std**2
     noise = settings.gyro_noise_density**2 / duration
     earth = state.earth_rate_map
     vertical_rate = dot(up, earth)
@@ -363,7 +371,9 @@ def set_gyro_bias(state, mean_rate, rotation, up, duration, still, settings):
         horizontal_variance = noise + horizontal_square * settings.initial_heading_std**2
     vertical_gain = prior / (prior + vertical_variance) if still and prior > 0.0 else 0.0
     horizontal_gain = prior / (prior + horizontal_variance) if still and prior > 0.0 else 0.0
-    mean_map = rotate(rotation, mean_rate)
+    mean_map = rotate(
+        rotation, (mean_rate[0] - prior_bias[0], mean_rate[1] - prior_bias[1], mean_rate[2] - prior_bias[2])
+    )
     excess = (mean_map[0] - known[0], mean_map[1] - known[1], mean_map[2] - known[2])
     vertical = dot(up, excess)
     bias = rotate_back(
@@ -378,7 +388,7 @@ def set_gyro_bias(state, mean_rate, rotation, up, duration, still, settings):
     across = prior * (1.0 - horizontal_gain)
     along = prior * (1.0 - vertical_gain)
     for i in range(3):
-        state.gyro_bias[i] = bias[i]
+        state.gyro_bias[i] = prior_bias[i] + bias[i]
         for j in range(3):
             state.covariance[GYRO_BIAS + i, GYRO_BIAS + j] = (along - across) * up_body[i] * up_body[j]
         state.covariance[GYRO_BIAS + i, GYRO_BIAS + i] += across
@@ -441,6 +451,32 @@ def start_position(state, payload):
 
 
 @njit
+def place(state, position, position_covariance, heading, heading_std, settings):
+    """Put base_link to a position (m, map) with a covariance (3, 3) and a heading (rad), whatever was known before."""
+    covariance = state.covariance
+    for i in range(3):
+        for j in range(ERROR_SIZE):
+            covariance[POSITION + i, j] = 0.0
+            covariance[j, POSITION + i] = 0.0
+    if state.position_known == 0:
+        for i in range(3):
+            for j in range(ERROR_SIZE):
+                covariance[VELOCITY + i, j] = 0.0
+                covariance[j, VELOCITY + i] = 0.0
+            covariance[VELOCITY + i, VELOCITY + i] = START_VELOCITY_STD**2
+    state.position_known = 0
+    set_heading(state, heading, heading_std, settings)
+    m = settings.imu_position_base
+    offset = rotate(to_matrix(state.attitude), rotate_back(settings.imu_to_base, (m[0], m[1], m[2])))
+    for i in range(3):
+        state.position_map[i] = position[i] + offset[i]
+        for j in range(3):
+            covariance[POSITION + i, POSITION + j] = position_covariance[i, j]
+    state.position_known = 1
+    state.heading_known = 1
+
+
+@njit
 def align_to_course(state, settings):
     """Take the unknown heading from the course, if that is certain and steady; the robot is driving forward."""
     v = state.velocity_map
@@ -470,4 +506,27 @@ def align_to_course(state, settings):
     ):
         return
     set_heading(state, math.atan2(v[1], v[0]), math.sqrt(course_variance + settings.course_std**2), settings)
+    state.heading_known = 1
+
+
+@njit
+def recall_heading(state, payload, settings):
+    """Take the remembered heading if the first fix (``payload``: rad, rad, m, covariance) finds the robot in its place.
+
+    The state has level and position already.
+    """
+    if settings.has_memory == 0 or state.restarts > 0 or state.heading_known == 1:
+        return
+    fix = geodetic_to_ecef(payload[0], payload[1], payload[2])
+    place, lever, mount = settings.remembered_place_ecef, settings.lever_arm_body, settings.imu_position_base
+    way = (fix[0] - place[0], fix[1] - place[1], fix[2] - place[2])
+    fix_std = math.sqrt(max(payload[3], payload[6], payload[8]))
+    # The antenna is at most this far from base_link, on whatever side.
+    reach = math.sqrt(dot(lever, lever)) + math.sqrt(dot(mount, mount))
+    std = math.sqrt(fix_std**2 + settings.remembered_place_std**2)
+    if math.sqrt(dot(way, way)) > reach + settings.remembered_place_tolerance + 3.0 * std:
+        return
+    f = settings.remembered_forward_ecef
+    forward = rotate_back(state.map_to_ecef, (f[0], f[1], f[2]))
+    set_heading(state, math.atan2(forward[1], forward[0]), settings.remembered_heading_std, settings)
     state.heading_known = 1

@@ -28,7 +28,11 @@ NEVER = -(2**62)
 
 
 class Status(IntEnum):
-    """What the estimator has, in the order in which it gets it."""
+    """What the estimator has, in the order in which it gets it.
+
+    COASTING: no position was accepted for a while. DEGRADED: fixes come and contradict the estimate. FAULT: the
+    estimate is not finite, only a reset helps.
+    """
 
     WAITING_IMU = 0
     LEVELLING = 1
@@ -37,6 +41,8 @@ class Status(IntEnum):
     ALIGNING = 4
     GOOD = 5
     COASTING = 6
+    DEGRADED = 7
+    FAULT = 8
 
 
 class Verdict(IntEnum):
@@ -151,13 +157,14 @@ AID = np.dtype(
         ("door", "i4"),
         ("verdict", "i4"),
         ("dof", "i4"),
+        ("told", "i4"),
         ("nis", "f8"),
         ("innovation", "f8", (3,)),
         ("payload", "f8", (PAYLOAD_SIZE,)),
     ],
     align=True,
 )
-"""One offered measurement: what was sent, and what became of it."""
+"""One offered measurement: what was sent, what became of it, and whether ``take_live`` has told that already."""
 
 RECORD = np.dtype(
     [
@@ -226,6 +233,17 @@ SETTINGS = np.dtype(
         ("course_min_speed", "f8"),
         ("course_std", "f8"),
         ("good_heading_std", "f8"),
+        # Memory of an earlier run: biases, place and heading of base_link (see ``warm_start``).
+        ("has_memory", "i8"),
+        ("remembered_accel_bias", "f8", (3,)),
+        ("remembered_accel_bias_std", "f8"),
+        ("remembered_gyro_bias", "f8", (3,)),
+        ("remembered_gyro_bias_std", "f8"),
+        ("remembered_place_ecef", "f8", (3,)),
+        ("remembered_place_std", "f8"),
+        ("remembered_place_tolerance", "f8"),
+        ("remembered_forward_ecef", "f8", (3,)),
+        ("remembered_heading_std", "f8"),
         ("output_interval", "i8"),
     ],
     align=True,

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy.special import chdtri
 
 from eskf_ros.compiled import njit
-from eskf_ros.earth import ecef_to_geodetic
+from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
 from eskf_ros.filter.aiding import gnss_position, gnss_velocity
 from eskf_ros.filter.alignment import (
     align_to_course,
@@ -19,6 +19,8 @@ from eskf_ros.filter.alignment import (
     move_datum,
     note_position,
     note_velocity,
+    place,
+    recall_heading,
     restart,
     set_datum,
     start_position,
@@ -60,6 +62,7 @@ from eskf_ros.filter.timeline import (
     take_final,
 )
 from eskf_ros.filter.update import update
+from eskf_ros.filter.warm_start import Memory, recall
 from eskf_ros.parameters import Parameters
 from eskf_ros.rotation import from_roll_pitch_yaw, to_matrix
 
@@ -179,6 +182,7 @@ def fuse(state, aids, i, settings, work):
     heading = heading_of(state, settings)
     if state.position_known == 0:
         start_position(state, aid.payload)
+        recall_heading(state, aid.payload, settings)
     size = linearize(state, aid, settings, work)
     for k in range(size):
         aid.innovation[k] = work.innovation[k]
@@ -224,6 +228,7 @@ class Navigator:
         self._work = allocate(WORK)
         self._rows = allocate(ODOMETRY, len(self._imu))
         self._offered = allocate(AID)
+        self._memory: tuple[Memory, float] | None = None
         self.configure(parameters)
         self.reset()
 
@@ -231,6 +236,8 @@ class Navigator:
         """Use other parameters from now on; history within the window is judged by them when it is applied again."""
         self.parameters = parameters
         self._settings = settings_from(parameters, self._output_rate)
+        if self._memory is not None:
+            recall(*self._memory, parameters, self._settings[0])
         self._gnss_offset = round(parameters.gnss.time_offset * SECOND)
 
     def reset(self) -> None:
@@ -252,20 +259,55 @@ class Navigator:
         self._stamp_difference: dict[Stream, float] = {}
         self._stand_ins = 0
 
+    def warm_start(self, memory: Memory, age: float) -> None:
+        """Offer what an earlier run knew, ``age`` seconds ago; to be called before the first sample."""
+        self._memory = memory, age
+        recall(memory, age, self.parameters, self._settings[0])
+
     def set_datum_here(self) -> bool:
         """Make the present position of the IMU the origin of the map; False while the position is unknown.
 
         A barrier: what came before is final, and nothing older is accepted afterwards.
         """
         self.update()
-        state, settings = self._states[0], self._settings[0]
+        state = self._states[0]
         if not state["position_known"]:
             return False
         ecef = state["origin_ecef"] + state["map_to_ecef"] @ state["position_map"]
+        latitude, longitude, altitude = ecef_to_geodetic(*ecef)
+        self.set_datum(math.degrees(latitude), math.degrees(longitude), altitude)
+        return True
+
+    def set_datum(self, latitude_deg: float, longitude_deg: float, altitude: float) -> None:
+        """Make a place on the ellipsoid the origin of the map, wherever the robot is. A barrier."""
+        self.update()
+        state, settings = self._states[0], self._settings[0]
         position, heading = tuple(state["position_map"]), heading_of(state, settings)
         self._refused.insert(0, self._take_records(True))
-        move_datum(state, *ecef_to_geodetic(*ecef))
-        note_jump(state, position, heading, settings)
+        datum = math.radians(latitude_deg), math.radians(longitude_deg), float(altitude)
+        if state["position_known"]:
+            move_datum(state, *datum)
+            note_jump(state, position, heading, settings)
+        else:
+            set_datum(state, *datum)
+        raise_barrier(self._states, self._blank, self._timeline)
+
+    def set_pose(
+        self, position_map: Sequence[float], position_covariance: FloatArray, heading: float, heading_std: float
+    ) -> bool:
+        """Put base_link to a position in map (m, covariance (3, 3) m2) with a heading (rad); roll and pitch stay.
+
+        False while level or datum are unknown. A barrier.
+        """
+        self.update()
+        state, settings = self._states[0], self._settings[0]
+        if not (state["level_known"] and state["datum_known"]):
+            return False
+        before, heading_before = tuple(state["position_map"]), heading_of(state, settings)
+        self._refused.insert(0, self._take_records(True))
+        covariance = np.ascontiguousarray(position_covariance, np.float64)
+        place(state, tuple(float(v) for v in position_map), covariance, float(heading), float(heading_std), settings)
+        note_jump(state, before, heading_before, settings)
         raise_barrier(self._states, self._blank, self._timeline)
         return True
 
@@ -368,6 +410,13 @@ class Navigator:
         """Return the records (RECORD) that became final since the last call: in the total order, the too late last."""
         return self._take_records(False)
 
+    def take_live(self) -> np.ndarray:
+        """Return the records of what was judged since the last call, as they stand: a later message may change them."""
+        judged = self._aids[: int(self._states["aid_next"][0])]
+        new = np.flatnonzero(judged["told"] == 0)
+        judged["told"] = 1
+        return np.array([tuple(judged[name][i] for name in RECORD.names or ()) for i in new], RECORD)
+
     def finish(self) -> np.ndarray:
         """End the data: return all remaining records, those that waited in vain for the IMU as ``waiting``."""
         self.update()
@@ -391,6 +440,31 @@ class Navigator:
         return Status(status_of(self._states[0], self._settings[0]))
 
     @property
+    def memory(self) -> Memory | None:
+        """What the next start wants to know (see `warm_start`); None while position or heading are unknown."""
+        state, row = self._states[0], self.odometry[0]
+        if row["status"] not in (Status.ALIGNING, Status.GOOD, Status.COASTING, Status.DEGRADED):
+            return None
+        ecef = state["origin_ecef"] + state["map_to_ecef"] @ row["position_map"]
+        latitude, longitude, altitude = ecef_to_geodetic(*ecef)
+        forward_map = np.array(to_matrix(tuple(row["attitude_body_to_map"])))[:, 0]
+        east, north, _ = np.array(east_north_up_to_ecef(latitude, longitude)).T @ state["map_to_ecef"] @ forward_map
+        variances = np.diagonal(row["pose_covariance"])
+        biases = {
+            name: tuple(row[name].tolist()) for name in ("accel_bias", "accel_bias_std", "gyro_bias", "gyro_bias_std")
+        }
+        return Memory(
+            stamp=int(row["stamp"]),
+            latitude_deg=math.degrees(latitude),
+            longitude_deg=math.degrees(longitude),
+            altitude=float(altitude),
+            position_std=math.sqrt(max(variances[:3])),
+            heading_deg=math.degrees(math.atan2(north, east)),
+            heading_std_deg=math.degrees(math.sqrt(variances[5])),
+            **biases,
+        )
+
+    @property
     def datum(self) -> tuple[float, float, float] | None:
         """Origin of the map frame: latitude and longitude (deg) and altitude (m), None before the first fix."""
         state = self._states[0]
@@ -404,6 +478,11 @@ class Navigator:
         """IMU samples offered, and refused or replaced by reason."""
         names = ("offered", "duplicate", "late", "bad_value", "bad_stamp")
         return {name: int(self._timeline[f"imu_{name}"][0]) for name in names}
+
+    @property
+    def waiting(self) -> int:
+        """How many measurements wait for the IMU samples of their time."""
+        return int(self._timeline["aid_count"][0] - self._states["aid_next"][0])
 
     @property
     def window_needed(self) -> float:
@@ -513,8 +592,11 @@ def compile_kernels() -> None:
     trial.odometry  # noqa: B018 - asked for its side effect
     trial.status  # noqa: B018
     trial._forget()
-    # Known by decree: the one method that asks for a position first.
-    trial._states["position_known"] = 1
+    trial.take_live()
+    trial.set_datum(0.0, 0.0, 0.0)
+    # Known by decree: these ask for level or position first.
+    trial._states["level_known"] = 1
+    trial.set_pose(point, np.eye(3), 0.0, 1.0)
     trial.set_datum_here()
 
 

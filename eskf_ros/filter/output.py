@@ -7,7 +7,7 @@ import math
 from eskf_ros.compiled import njit
 from eskf_ros.filter.aiding.gnss_velocity import body_rate
 from eskf_ros.filter.alignment import UNKNOWN_SPEED, heading_of
-from eskf_ros.filter.layout import ACCEL_BIAS, ATTITUDE, GYRO_BIAS, NEVER, POSITION, VELOCITY, Status
+from eskf_ros.filter.layout import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, NEVER, POSITION, VELOCITY, Status
 from eskf_ros.rotation import cross, from_matrix, from_rotation_vector, multiply, rotate, rotate_back, to_matrix
 
 WAITING_IMU = int(Status.WAITING_IMU)
@@ -17,9 +17,14 @@ WAITING_HEADING = int(Status.WAITING_HEADING)
 ALIGNING = int(Status.ALIGNING)
 GOOD = int(Status.GOOD)
 COASTING = int(Status.COASTING)
+DEGRADED = int(Status.DEGRADED)
+FAULT = int(Status.FAULT)
 
 SHORTEST_COAST = 1_000_000_000
 LONGEST_WAIT = 3_000_000_000
+
+CONTRADICTIONS = 3
+"""So many fixes in a row that were not fused as they came are more than outliers."""
 
 
 @njit
@@ -29,6 +34,8 @@ def status_of(state, settings):
         return WAITING_IMU
     if state.level_known == 0:
         return LEVELLING
+    if not is_finite(state):
+        return FAULT
     if state.position_known == 0:
         return WAITING_FIX
     if state.heading_known == 0:
@@ -36,9 +43,22 @@ def status_of(state, settings):
     patience = max(SHORTEST_COAST, min(LONGEST_WAIT, 2 * state.absolute_interval))
     if state.stamp - state.absolute_stamp > patience:
         return COASTING
+    if state.rejected_fixes >= CONTRADICTIONS:
+        return DEGRADED
     if state.covariance[ATTITUDE + 2, ATTITUDE + 2] > settings.good_heading_std**2:
         return ALIGNING
     return GOOD
+
+
+@njit
+def is_finite(state):
+    """Say whether position, velocity, attitude and their variances are numbers."""
+    total = state.attitude[0] + state.attitude[1] + state.attitude[2] + state.attitude[3]
+    for i in range(3):
+        total += state.position_map[i] + state.velocity_map[i]
+    for i in range(ERROR_SIZE):
+        total += state.covariance[i, i]
+    return math.isfinite(total)
 
 
 @njit

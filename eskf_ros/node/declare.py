@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -24,6 +24,11 @@ def declare(node: Node, source: str = "") -> Parameters:
     for name, value in to_mapping(parameters).items():
         node.declare_parameter(name, _ros_value(value), _descriptor(known[name]), ignore_override=True)
     return parameters
+
+
+def given_names(node: Node) -> set[str]:
+    """Names of the parameters that a file or the command line gives."""
+    return set(_overrides(node))
 
 
 def unused_overrides(node: Node) -> list[str]:
@@ -67,6 +72,8 @@ def _descriptor(leaf: Leaf) -> ParameterDescriptor:
     )
     minimum = rule.minimum if rule.above is None else rule.above
     maximum = rule.maximum if rule.below is None else rule.below
+    if leaf.kind == "integer":
+        descriptor.integer_range = [IntegerRange(from_value=minimum, to_value=maximum, step=0)]
     # rclpy applies ranges to single numbers only, and finds NaN outside of every range.
     if leaf.kind == "float" and not rule.nan_allowed and isinstance(minimum, float) and isinstance(maximum, float):
         descriptor.floating_point_range = [FloatingPointRange(from_value=minimum, to_value=maximum, step=0.0)]

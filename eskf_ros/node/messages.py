@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -11,15 +10,15 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from sensor_msgs.msg import NavSatFix
 
-from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic, geodetic_to_ecef
 from eskf_ros.filter.layout import STREAM_NAMES, Verdict
+from eskf_ros.simulate.map_frame import MapFrame
 
 SECOND = 1_000_000_000
 
 
 def set_header(header: Any, stamp: int, frame: str) -> None:
-    """Fill in a message header; ``stamp`` in ns."""
-    header.stamp.sec, header.stamp.nanosec = divmod(stamp, SECOND)
+    """Fill in a message header; ``stamp`` in ns, negative before the first message."""
+    header.stamp.sec, header.stamp.nanosec = divmod(max(0, stamp), SECOND)
     header.frame_id = frame
 
 
@@ -31,7 +30,7 @@ def key_values(values: dict[str, object]) -> list[KeyValue]:
 def bias_message(row: np.void, frame: str) -> TwistWithCovarianceStamped:
     """Biases in IMU axes: linear m/s2 of the accelerometer, angular rad/s of the gyro, with their variances."""
     message = TwistWithCovarianceStamped()
-    set_header(message.header, max(0, int(row["stamp"])), frame)
+    set_header(message.header, int(row["stamp"]), frame)
     linear, angular = message.twist.twist.linear, message.twist.twist.angular
     linear.x, linear.y, linear.z = row["accel_bias"].tolist()
     angular.x, angular.y, angular.z = row["gyro_bias"].tolist()
@@ -42,15 +41,9 @@ def bias_message(row: np.void, frame: str) -> TwistWithCovarianceStamped:
 
 def fix_message(row: np.void, datum: tuple[float, float, float], frame: str) -> NavSatFix:
     """The position of base_link as NavSatFix, covariance in east, north, up of the map."""
-    latitude, longitude = math.radians(datum[0]), math.radians(datum[1])
-    origin = geodetic_to_ecef(latitude, longitude, datum[2])
-    ecef = np.add(origin, np.array(east_north_up_to_ecef(latitude, longitude)) @ row["position_map"])
-    geodetic = ecef_to_geodetic(*ecef)
     message = NavSatFix()
     set_header(message.header, int(row["stamp"]), frame)
-    message.latitude = math.degrees(geodetic[0])
-    message.longitude = math.degrees(geodetic[1])
-    message.altitude = float(geodetic[2])
+    message.latitude, message.longitude, message.altitude = MapFrame(datum).to_geodetic_deg(row["position_map"])
     message.position_covariance = np.ascontiguousarray(row["pose_covariance"][:3, :3]).ravel()
     message.position_covariance_type = NavSatFix.COVARIANCE_TYPE_KNOWN
     return message

@@ -2,34 +2,32 @@
 
 from __future__ import annotations
 
-import math
+import time
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistWithCovarianceStamped
-from nav_msgs.msg import Odometry
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
 
-from eskf_ros.filter.layout import Verdict
+from eskf_ros.filter.layout import Status, Verdict
 from eskf_ros.filter.navigator import Navigator, compile_kernels
-from eskf_ros.node.cdr import (
-    AnyOdometryWriter,
-    ImuReader,
-    ImuSample,
-    LayoutError,
-    OdometryMessageWriter,
-    OdometryWriter,
-    imu_from_message,
-)
+from eskf_ros.filter.warm_start import Memory
+from eskf_ros.node import robot_localization, transforms
+from eskf_ros.node.cdr import ImuReader, ImuSample, imu_from_message
 from eskf_ros.node.clocks import SECOND, Stamp, StampMonitor
-from eskf_ros.node.declare import LiveParameters, declare
+from eskf_ros.node.declare import LiveParameters, declare, given_names, unused_overrides
+from eskf_ros.node.extrinsics import ANTENNA, IMU, Extrinsics
+from eskf_ros.node.memory import read_memory, write_memory
 from eskf_ros.node.messages import bias_message, fix_message, record_statuses
+from eskf_ros.node.outputs import OUTPUT_QOS, OVERRIDING, Outputs
 from eskf_ros.node.status import status_report
 from eskf_ros.parameters import Parameters
 
@@ -38,6 +36,9 @@ INPUT_DEPTH = 1000
 
 GNSS_DEPTH = 50
 REPORT_PERIOD = 1.0
+
+WATCH_EVERY = 10
+"""Reports from one look for a second publisher of our transforms to the next."""
 
 
 class EskfNode(Node):
@@ -52,67 +53,70 @@ class EskfNode(Node):
         self.navigator = Navigator(self.parameters)
         self.trouble: dict[str, int] = {}
         self.verdicts: dict[tuple[int, Verdict], int] = {}
-        self.published = 0
         self.resets = 0
+        self.longest_callback = 0.0
+        self.extrinsics = Extrinsics(
+            self.parameters.frames.base_link, given_names(self), self.parameters.frames.extrinsics == "auto"
+        )
+        self._frames_met: set[tuple[str, str | bytes]] = set()
+        self._is_judging = False
+        self._reports = 0
+        self._memory = self._read_memory()
         self._compile()
         self._live = LiveParameters(self, self.parameters, self._configure)
 
-        frames, topics = self.parameters.frames, self.parameters.topics
-        self._global_writer = self._writer(frames.map, frames.base_link)
-        self._local_writer = self._writer(frames.odom, frames.base_link)
-        output = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-        self._global = self.create_publisher(Odometry, "odometry/global", output)
-        self._local = self.create_publisher(Odometry, "odometry/local", output)
-        self._filtered = self.create_publisher(NavSatFix, "gps/filtered", output)
-        self._bias = self.create_publisher(TwistWithCovarianceStamped, "imu/bias", output)
-        self._aids = self.create_publisher(DiagnosticArray, "eskf/aids", output)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", output)
+        self.outputs = Outputs(self, self.parameters, self.note_trouble)
+        self._filtered = self.create_publisher(NavSatFix, "gps/filtered", OUTPUT_QOS)
+        self._bias = self.create_publisher(TwistWithCovarianceStamped, "imu/bias", OUTPUT_QOS)
+        self._aids = self.create_publisher(DiagnosticArray, "eskf/aids", OUTPUT_QOS)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", OUTPUT_QOS)
 
-        window = self.parameters.history.window
-        self.monitors = {
-            name: StampMonitor(self.resolve_topic_name(name), window)
-            for name in (topics.imu, topics.gnss_fix, topics.gnss_velocity)
-        }
         self._imu_reader = ImuReader()
-        # Best effort matches every publisher, reliable ones too.
-        imu_qos = QoSProfile(depth=INPUT_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-        gnss_qos = QoSProfile(depth=GNSS_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
-        for qos in (imu_qos, gnss_qos):
-            qos.durability = DurabilityPolicy.VOLATILE
-        overriding = QoSOverridingOptions.with_default_policies()
-        # All come serialised: a message that cannot be read fails in our callback, not in the executor.
-        self.inputs = [
-            self.create_subscription(
-                kind, topic, self._contained(callback), qos, raw=True, qos_overriding_options=overriding
+        topics, window = self.parameters.topics, self.parameters.history.window
+        self.monitors: dict[str, StampMonitor] = {}
+        self.inputs = {}
+        for kind, topic, callback, depth in (
+            (Imu, topics.imu, self._on_imu, INPUT_DEPTH),
+            (NavSatFix, topics.gnss_fix, self._on_fix, GNSS_DEPTH),
+            (TwistWithCovarianceStamped, topics.gnss_velocity, self._on_velocity, GNSS_DEPTH),
+        ):
+            self.monitors[topic] = StampMonitor(self.resolve_topic_name(topic), window)
+            # All come serialised: a message that cannot be read fails in our callback, not in the executor.
+            self.inputs[topic] = self.create_subscription(
+                kind, topic, self._contained(callback), input_qos(depth), raw=True, qos_overriding_options=OVERRIDING
             )
-            for kind, topic, callback, qos in (
-                (Imu, topics.imu, self._on_imu, imu_qos),
-                (NavSatFix, topics.gnss_fix, self._on_fix, gnss_qos),
-                (TwistWithCovarianceStamped, topics.gnss_velocity, self._on_velocity, gnss_qos),
-            )
-        ]
-        self.create_service(Trigger, "~/reset", self._on_reset)
-        self.create_service(Trigger, "~/set_datum_here", self._on_set_datum_here)
-        self.create_timer(REPORT_PERIOD, self._contained(self._report))
+        self._transform_input: Any = None
+        self._open_transform_inputs()
+        self.create_service(Trigger, "~/reset", self._served(self._on_reset))
+        self.create_service(Trigger, "~/set_datum_here", self._served(self._on_set_datum_here))
+        if robot_localization.services is not None:
+            robot_localization.RobotLocalizationServices(self, self.navigator)
+        # Not on the clock of the node: a simulation that has not begun is worth a report too.
+        self.create_timer(REPORT_PERIOD, self._contained(self._report), clock=Clock(clock_type=ClockType.STEADY_TIME))
+        for name in unused_overrides(self):
+            self.get_logger().warn(f"parameter {name} belongs to nothing here and has no effect")
         self.get_logger().info("ready: waiting for " + ", ".join(m.topic for m in self.monitors.values()))
 
     def close(self) -> None:
-        """Publish the last report; called while the publishers still work."""
+        """Publish the last report and write the warm start file; called while the publishers still work."""
         self._contained(self._report)()
+        self._contained(self._write_memory)()
+
+    def note_trouble(self, text: str) -> None:
+        """Count a kind of trouble, and log it the first time."""
+        if text not in self.trouble and len(self.trouble) < 100:
+            self.get_logger().error(text)
+            self.trouble[text] = 0
+        if text in self.trouble:
+            self.trouble[text] += 1
 
     def _compile(self) -> None:
         """Have every kernel compiled before the first message comes: from the cache, or anew for half a minute."""
         self.get_logger().info("starting the estimator; the first start after an installation compiles it (a minute)")
         compile_kernels()
+        fix_message(self.navigator.odometry[0], (0.0, 0.0, 0.0), "")
 
-    def _writer(self, frame: str, child_frame: str) -> AnyOdometryWriter:
-        try:
-            return OdometryWriter(frame, child_frame)
-        except LayoutError as error:
-            self.get_logger().warn(f"{error}; publishing through message objects, which costs more")
-            return OdometryMessageWriter(frame, child_frame)
-
-    def _contained(self, callback: Any) -> Any:
+    def _contained(self, callback: Callable[..., None]) -> Callable[..., None]:
         """Let no message and no mistake of ours end the node: count it, log it, go on."""
 
         def contain(*arguments: Any) -> None:
@@ -123,25 +127,34 @@ class EskfNode(Node):
 
         return contain
 
-    def note_trouble(self, text: str) -> None:
-        """Count a kind of trouble, and log it the first time."""
-        if text not in self.trouble and len(self.trouble) < 100:
-            self.get_logger().error(text)
-            self.trouble[text] = 0
-        if text in self.trouble:
-            self.trouble[text] += 1
+    def _served(self, callback: Callable[[], tuple[bool, str]]) -> Callable[..., Trigger.Response]:
+        """Answer a Trigger with what a callback returns, or with its error."""
+
+        def serve(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            try:
+                response.success, response.message = callback()
+            except Exception as error:
+                response.success, response.message = False, f"{type(error).__name__}: {error}"
+            return response
+
+        return serve
 
     def _configure(self, parameters: Parameters) -> None:
-        self.parameters = parameters
-        self.navigator.configure(parameters)
+        self.parameters = self.extrinsics.completed(parameters)
+        self.navigator.configure(self.parameters)
 
     def _now(self) -> int:
         return int(self.get_clock().now().nanoseconds)
 
-    def _is_usable(self, topic: str, stamp: int) -> bool:
-        judgement = self.monitors[topic].note(stamp, self._now())
-        if judgement == Stamp.STARTED_AGAIN and topic == self.parameters.topics.imu:
+    def _is_usable(self, topic: str, stamp: int, frame: str | bytes) -> bool:
+        """Note stamp (ns) and frame of a message; False if it has no place in time."""
+        is_aid = topic != self.parameters.topics.imu
+        offset = round(self.parameters.gnss.time_offset * SECOND) if is_aid and stamp else 0
+        judgement = self.monitors[topic].note(stamp + offset, self._now())
+        if judgement == Stamp.STARTED_AGAIN and not is_aid:
             self._reset(f"the stamps of {self.monitors[topic].topic} went back")
+        if (topic, frame) not in self._frames_met:
+            self._meet_frame(topic, frame)
         return judgement != Stamp.ZERO
 
     def _reset(self, why: str) -> None:
@@ -153,20 +166,27 @@ class EskfNode(Node):
                 monitor.restart()
 
     def _on_imu(self, data: bytes) -> None:
+        started = time.perf_counter()
         sample: ImuSample | None = self._imu_reader.read(data)
         if sample is None:
             sample = imu_from_message(deserialize_message(data, Imu))
-        stamp, specific_force, angular_rate, _ = sample
-        if not self._is_usable(self.parameters.topics.imu, stamp):
+        stamp, specific_force, angular_rate, frame = sample
+        if not self._is_usable(self.parameters.topics.imu, stamp, frame):
             return
+        if self._memory is not None:
+            self._offer_memory(stamp)
         rows = self.navigator.push_imu(np.array([stamp]), np.array([specific_force]), np.array([angular_rate]))
         for row in rows:
-            self._publish(row)
+            self.outputs.publish(row)
+        if self._is_judging:
+            self._tell_verdicts()
+        self.longest_callback = max(self.longest_callback, time.perf_counter() - started)
 
     def _on_fix(self, data: bytes) -> None:
         message: NavSatFix = deserialize_message(data, NavSatFix)
-        stamp = message.header.stamp.sec * SECOND + message.header.stamp.nanosec
-        if self._is_usable(self.parameters.topics.gnss_fix, stamp):
+        header = message.header
+        stamp = header.stamp.sec * SECOND + header.stamp.nanosec
+        if self._is_usable(self.parameters.topics.gnss_fix, stamp, header.frame_id):
             self.navigator.push_gnss_position(
                 stamp,
                 message.latitude,
@@ -177,61 +197,141 @@ class EskfNode(Node):
                 message.status.status,
                 self._now(),
             )
+            self._is_judging = True
 
     def _on_velocity(self, data: bytes) -> None:
         message: TwistWithCovarianceStamped = deserialize_message(data, TwistWithCovarianceStamped)
-        stamp = message.header.stamp.sec * SECOND + message.header.stamp.nanosec
-        if self._is_usable(self.parameters.topics.gnss_velocity, stamp):
+        header = message.header
+        stamp = header.stamp.sec * SECOND + header.stamp.nanosec
+        if self._is_usable(self.parameters.topics.gnss_velocity, stamp, header.frame_id):
             linear = message.twist.twist.linear
             covariance = np.reshape(message.twist.covariance, (6, 6))[:3, :3].ravel()
             self.navigator.push_gnss_velocity(stamp, (linear.x, linear.y, linear.z), covariance, self._now())
+            self._is_judging = True
 
-    def _publish(self, row: np.void) -> None:
-        """Publish both odometries of one IMU sample; nothing that is not finite leaves the node."""
-        pose, twist = row["pose_covariance"], row["twist_covariance"]
-        velocity, rate = row["velocity_body"].tolist(), row["angular_rate_body"].tolist()
-        local_position, local_attitude = row["position_odom"].tolist(), row["attitude_body_to_odom"].tolist()
-        position, attitude = row["position_map"].tolist(), row["attitude_body_to_map"].tolist()
-        if not math.isfinite(
-            sum(velocity) + sum(rate) + sum(local_position) + sum(position) + sum(attitude) + pose.sum() + twist.sum()
-        ):
-            self.note_trouble("a result was not finite and was not published")
-            return
-        stamp = int(row["stamp"])
-        local_pose = np.diag([float(row["local_position_variance"])] * 3 + [0.0] * 3)
-        local_pose[3:, 3:] = pose[3:, 3:]
-        local_pose[5, :] = local_pose[:, 5] = 0.0
-        local_pose[5, 5] = row["local_heading_variance"]
-        self._local.publish(
-            self._local_writer.write(stamp, local_position, local_attitude, local_pose, velocity, rate, twist)
-        )
-        if row["position_known"]:
-            self._global.publish(self._global_writer.write(stamp, position, attitude, pose, velocity, rate, twist))
-        self.published += 1
+    def _tell_verdicts(self) -> None:
+        """Publish what became of the measurements up to the newest sample; later messages may still change it."""
+        records = self.navigator.take_live()
+        if len(records):
+            self._aids.publish(record_statuses(records, self.get_clock().now().to_msg()))
+        self._is_judging = self.navigator.waiting > 0
 
     def _report(self) -> None:
-        """Once a second: records, biases, filtered fix, diagnostics."""
+        """Once a second: final verdicts, biases, filtered fix, diagnostics, other publishers of our transforms."""
         records = self.navigator.take_records()
         for record in records:
             key = (int(record["stream"]), Verdict(int(record["verdict"])))
             self.verdicts[key] = self.verdicts.get(key, 0) + 1
         stamp = self.get_clock().now().to_msg()
-        if len(records):
-            self._aids.publish(record_statuses(records, stamp))
+        refused = records[records["verdict"] == Verdict.OUTSIDE_HISTORY]
+        if len(refused):
+            self._aids.publish(record_statuses(refused, stamp))
         row, datum = self.navigator.odometry[0], self.navigator.datum
-        self._bias.publish(bias_message(row, self.parameters.frames.base_link))
-        if row["position_known"] and datum is not None:
-            self._filtered.publish(fix_message(row, datum, self.parameters.frames.base_link))
+        if row["status"] == Status.FAULT:
+            self.note_trouble("the estimate is not finite: call the service ~/reset")
+        else:
+            self._bias.publish(bias_message(row, self.parameters.frames.base_link))
+            if row["position_known"] and datum is not None:
+                self._filtered.publish(fix_message(row, datum, self.parameters.frames.base_link))
         self._diagnostics.publish(status_report(self, stamp))
+        self.longest_callback = 0.0
+        self._watch_transforms()
+        self._reports += 1
 
-    def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_reset(self) -> tuple[bool, str]:
         self._reset("reset was asked for")
-        response.success, response.message = True, "the estimator starts again"
-        return response
+        return True, "the estimator starts again"
 
-    def _on_set_datum_here(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = self.navigator.set_datum_here()
-        response.message = (
-            "the map begins at the present position" if response.success else "the position is not known yet"
+    def _on_set_datum_here(self) -> tuple[bool, str]:
+        if self.navigator.set_datum_here():
+            return True, "the map begins at the present position"
+        return False, "the position is not known yet"
+
+    def _open_transform_inputs(self) -> None:
+        """Listen to static transforms for the places of the sensors, and to another node's odom -> base_link."""
+        if transforms.TFMessage is None:
+            return
+        if self.parameters.frames.extrinsics == "auto":
+            latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            self.create_subscription(
+                transforms.TFMessage, "/tf_static", self._contained(self._on_static_transforms), latched
+            )
+        if self.parameters.output.tf == "map_to_odom":
+            self._listen_to_transforms()
+
+    def _listen_to_transforms(self) -> None:
+        assert self.outputs.transforms is not None
+        self._transform_input = self.create_subscription(
+            transforms.TFMessage, "/tf", self._contained(self.outputs.transforms.receive), INPUT_DEPTH
         )
-        return response
+
+    def _watch_transforms(self) -> None:
+        """Look now and then, for one report's time, who else publishes our transforms: all the time costs too much."""
+        output = self.outputs.transforms
+        if output is None:
+            return
+        listens_always = self.parameters.output.tf == "map_to_odom"
+        phase = self._reports % WATCH_EVERY
+        if phase == 1 and self.count_publishers("/tf") > 1:
+            output.watch.begin()
+            if not listens_always:
+                self._listen_to_transforms()
+        elif phase == 2:
+            output.watch.end()
+            if self._transform_input is not None and not listens_always:
+                self.destroy_subscription(self._transform_input)
+                self._transform_input = None
+
+    def _on_static_transforms(self, message: Any) -> None:
+        for transform in message.transforms:
+            self.extrinsics.note_transform(transform)
+        self._complete_extrinsics()
+
+    def _meet_frame(self, topic: str, frame: str | bytes) -> None:
+        """Take note of a frame name that a topic has not used before."""
+        if len(self._frames_met) > 100:
+            return
+        self._frames_met.add((topic, frame))
+        sensor = IMU if topic == self.parameters.topics.imu else ANTENNA
+        self.extrinsics.note_frame(sensor, frame.decode(errors="replace") if isinstance(frame, bytes) else frame)
+        self._complete_extrinsics()
+
+    def _complete_extrinsics(self) -> None:
+        found = self.extrinsics.find()
+        for line in found:
+            self.get_logger().info(line)
+        if found:
+            self._configure(self._live.current)
+            if self.navigator.status > Status.LEVELLING:
+                self._reset("the place of a sensor has become known")
+
+    def _read_memory(self) -> Memory | None:
+        path = self.parameters.warm_start.file
+        if not path:
+            return None
+        try:
+            return read_memory(Path(path).expanduser())
+        except ValueError as error:
+            self.get_logger().warn(f"warm_start.file: {error}; starting without it")
+            return None
+
+    def _offer_memory(self, stamp: int) -> None:
+        """Give the estimator what the last run knew, if that is not too old at the first IMU sample."""
+        assert self._memory is not None
+        age = (stamp - self._memory.stamp) / SECOND
+        if 0.0 <= age <= self.parameters.warm_start.max_age:
+            self.navigator.warm_start(self._memory, age)
+            self.get_logger().info(f"warm start from what was known {age:.0f} s ago")
+        else:
+            self.get_logger().info(f"the warm start file is {age:.0f} s old and is not used (warm_start.max_age)")
+        self._memory = None
+
+    def _write_memory(self) -> None:
+        path, memory = self.parameters.warm_start.file, self.navigator.memory
+        if path and memory is not None:
+            write_memory(Path(path).expanduser(), memory)
+
+
+def input_qos(depth: int) -> QoSProfile:
+    """Best effort matches every publisher, reliable ones too."""
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)

@@ -3,32 +3,41 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from eskf_ros.filter.layout import STREAM_NAMES, Status
 from eskf_ros.node.clocks import clock_complaints
+from eskf_ros.node.extrinsics import ANTENNA, IMU
 from eskf_ros.node.messages import key_values
 
 if TYPE_CHECKING:
     from eskf_ros.node.node import EskfNode
+
+RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
+TRANSIENT_LOCAL, VOLATILE = DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE
 
 SILENCE = 3.0
 """Seconds without a message after which a topic is called silent."""
 
 
 def status_report(node: EskfNode, stamp: Time) -> DiagnosticArray:
-    """One status: OK when the state is GOOD and nothing is wrong."""
+    """One status: OK when the state is GOOD and nothing is wrong, ERROR when only a reset helps."""
     now = node.get_clock().now().nanoseconds
     row = node.navigator.odometry[0]
     status = Status(int(row["status"]))
     problems = [*node.navigator.complaints, *clock_complaints(node.monitors.values(), now)]
+    problems += [*mismatches(node), *second_publishers(node)]
     problems += [f"{text} ({count} times)" for text, count in node.trouble.items()]
     waiting = waiting_for(node, status, now)
     level = DiagnosticStatus.OK if status == Status.GOOD and not problems else DiagnosticStatus.WARN
+    if status == Status.FAULT:
+        level = DiagnosticStatus.ERROR
     report = DiagnosticArray()
     report.header.stamp = stamp
     report.status.append(
@@ -48,6 +57,10 @@ def waiting_for(node: EskfNode, status: Status, now: int) -> list[str]:
     names = node.parameters.topics
     if status in (Status.WAITING_IMU, Status.LEVELLING):
         return missing(node, names.imu, now) or ["standing still or driving steadily for a moment"]
+    if status == Status.FAULT:
+        return ["a reset: call the service ~/reset"]
+    if status == Status.DEGRADED:
+        return ["fixes that agree with the estimate: see eskf/aids"]
     if status in (Status.WAITING_FIX, Status.COASTING):
         return missing(node, names.gnss_fix, now) or ["fixes come, but none was accepted lately: see eskf/aids"]
     if status == Status.WAITING_HEADING:
@@ -64,7 +77,59 @@ def missing(node: EskfNode, name: str, now: int) -> list[str]:
         return []
     publishers = node.count_publishers(monitor.topic)
     since = "no message" if math.isnan(timing.silence) else f"no message for {timing.silence:.0f} s"
-    return [f"{since} on {monitor.topic}; {publishers} publishers"]
+    return [f"{since} on {monitor.topic}; {publishers} publisher{'' if publishers == 1 else 's'}"]
+
+
+def mismatches(node: EskfNode) -> list[str]:
+    """Publishers whose messages cannot reach us, and subscribers that ours cannot reach: type or quality of service."""
+    found = []
+    for subscription in node.inputs.values():
+        wanted = subscription.qos_profile
+        for other in node.get_publishers_info_by_topic(subscription.topic_name):
+            reason = ""
+            if other.topic_type != type_name(subscription.msg_type):
+                reason = f"sends {other.topic_type}, {type_name(subscription.msg_type)} is expected"
+            elif wanted.reliability == RELIABLE and other.qos_profile.reliability == BEST_EFFORT:
+                reason = "is best effort, this node was told to ask for reliable (qos_overrides)"
+            elif wanted.durability == TRANSIENT_LOCAL and other.qos_profile.durability == VOLATILE:
+                reason = "is volatile, this node was told to ask for transient local (qos_overrides)"
+            if reason:
+                found.append(f"the publisher {node_name(other)} of {subscription.topic_name} {reason}")
+    for publisher in node.outputs.publishers:
+        offered = publisher.qos_profile
+        for other in node.get_subscriptions_info_by_topic(publisher.topic_name):
+            reason = ""
+            if other.qos_profile.reliability == RELIABLE and offered.reliability == BEST_EFFORT:
+                reason = "asks for reliable, but is offered best effort (qos_overrides)"
+            elif other.qos_profile.durability == TRANSIENT_LOCAL and offered.durability == VOLATILE:
+                reason = "asks for transient local, but is offered volatile"
+            if reason:
+                found.append(f"the subscriber {node_name(other)} of {publisher.topic_name} {reason}")
+    return found
+
+
+def type_name(kind: Any) -> str:
+    """sensor_msgs/msg/Imu of the class."""
+    package, subfolder = kind.__module__.split(".")[:2]
+    return f"{package}/{subfolder}/{kind.__name__}"
+
+
+def node_name(endpoint: TopicEndpointInfo) -> str:
+    """Name of the node at one end of a topic."""
+    return f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
+
+
+def second_publishers(node: EskfNode) -> list[str]:
+    """Transforms that are ours and that somebody else publishes too."""
+    output = node.outputs.transforms
+    if output is None or not output.watch.strangers:
+        return []
+    own = node.get_fully_qualified_name()
+    names = sorted({node_name(end) for end in node.get_publishers_info_by_topic("/tf")} - {own})
+    return [
+        f"the transform {', '.join(output.watch.strangers)} is published by another node too (publishers of /tf: "
+        f"{', '.join(names) or own}): stop one of them, or set output.tf to map_to_odom or none"
+    ]
 
 
 def figures(node: EskfNode, row: np.void) -> dict[str, object]:
@@ -72,14 +137,19 @@ def figures(node: EskfNode, row: np.void) -> dict[str, object]:
     sigma = [math.sqrt(max(0.0, row["pose_covariance"][i, i])) for i in range(6)]
     return {
         "position std (m)": " ".join(f"{value:.3f}" for value in sigma[:3]),
+        "velocity std (m/s)": " ".join(f"{math.sqrt(max(0.0, row['twist_covariance'][i, i])):.3f}" for i in range(3)),
         "heading std (deg)": f"{math.degrees(sigma[5]):.2f}",
         "accelerometer bias (m/s2)": " ".join(f"{value:.4f}" for value in row["accel_bias"]),
         "gyro bias (rad/s)": " ".join(f"{value:.6f}" for value in row["gyro_bias"]),
-        "odometries published": node.published,
+        "odometries published": node.outputs.published,
         "restarts": node.navigator.restarts,
         "resets": node.resets,
         "datum": node.navigator.datum,
         "window needed (s)": node.navigator.window_needed,
+        "history (kB)": node.navigator.held_bytes // 1024,
+        "longest callback (ms)": f"{1e3 * node.longest_callback:.2f}",
+        "place of the IMU": node.extrinsics.source_of(IMU),
+        "place of the antenna": node.extrinsics.source_of(ANTENNA),
     }
 
 

@@ -47,6 +47,17 @@ class MapFrame:
         """Return the normal gravity vector in ``map`` axes (n, 3), m/s2, at positions in ``map`` (n, 3), m."""
         return _gravity_ecef(self.to_ecef(position_map)) @ self.rotation_map_to_ecef
 
+    def to_geodetic_deg(self, position_map: Array) -> tuple[float, float, float]:
+        """Return latitude and longitude (deg) and ellipsoidal altitude (m) of one position (3,) in ``map``, m."""
+        x, y, z = (self.origin_ecef + self.rotation_map_to_ecef @ position_map).tolist()
+        latitude, longitude, altitude = earth.ecef_to_geodetic(x, y, z)
+        return math.degrees(latitude), math.degrees(longitude), altitude
+
+    def from_geodetic_deg(self, latitude_deg: float, longitude_deg: float, altitude: float) -> Array:
+        """Return the position (3,) in ``map``, m, of one place: degrees and ellipsoidal altitude in m."""
+        ecef = earth.geodetic_to_ecef(math.radians(latitude_deg), math.radians(longitude_deg), altitude)
+        return self.rotation_map_to_ecef.T @ (ecef - self.origin_ecef)
+
 
 def to_geodetic(position_ecef: Array) -> Array:
     """Return latitude, longitude (rad), ellipsoidal altitude (m) as (n, 3) of ECEF positions (n, 3), m."""

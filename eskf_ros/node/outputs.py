@@ -1,0 +1,104 @@
+"""What the node publishes for every IMU sample: both odometries and the transforms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+
+from eskf_ros.node import transforms
+from eskf_ros.node.cdr import AnyOdometryWriter, LayoutError, OdometryMessageWriter, OdometryWriter
+from eskf_ros.node.planar import flatten, flatten_covariance
+from eskf_ros.node.transforms import TransformOutput
+from eskf_ros.parameters import Parameters
+
+OUTPUT_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+OVERRIDING = QoSOverridingOptions.with_default_policies()
+
+
+class Outputs:
+    """Publishes the rows of the estimator; nothing that is not finite leaves the node.
+
+    Attributes:
+        published: rows that became odometry.
+        transforms: the output on /tf; None where it is off.
+    """
+
+    def __init__(self, node: Node, parameters: Parameters, note_trouble: Callable[[str], None]) -> None:
+        self._node = node
+        self._note_trouble = note_trouble
+        self._two_d = parameters.output.two_d
+        self._divisor = parameters.output.rate_divisor
+        self._rows = 0
+        self.published = 0
+        frames = parameters.frames
+        self._global_writer = self._writer(frames.map, frames.base_link)
+        self._local_writer = self._writer(frames.odom, frames.base_link)
+        self._global = node.create_publisher(Odometry, "odometry/global", OUTPUT_QOS, qos_overriding_options=OVERRIDING)
+        self._local = node.create_publisher(Odometry, "odometry/local", OUTPUT_QOS, qos_overriding_options=OVERRIDING)
+        self.publishers = (self._global, self._local)
+        self.transforms = self._open_transforms(parameters)
+
+    def publish(self, row: np.void) -> None:
+        """Publish one ODOMETRY row, which may be changed."""
+        self._rows += 1
+        if self._rows % self._divisor:
+            return
+        if self._two_d:
+            flatten(row)
+        pose, twist = row["pose_covariance"], row["twist_covariance"]
+        velocity, rate = row["velocity_body"].tolist(), row["angular_rate_body"].tolist()
+        local_position, local_attitude = row["position_odom"].tolist(), row["attitude_body_to_odom"].tolist()
+        position, attitude = row["position_map"].tolist(), row["attitude_body_to_map"].tolist()
+        if not math.isfinite(
+            sum(velocity) + sum(rate) + sum(local_position) + sum(position) + sum(attitude) + pose.sum() + twist.sum()
+        ):
+            self._note_trouble("a result was not finite and was not published")
+            return
+        stamp = int(row["stamp"])
+        local_pose = self._local_covariance(row)
+        self._local.publish(
+            self._local_writer.write(stamp, local_position, local_attitude, local_pose, velocity, rate, twist)
+        )
+        if row["position_known"]:
+            self._global.publish(self._global_writer.write(stamp, position, attitude, pose, velocity, rate, twist))
+        if self.transforms is not None:
+            self.transforms.send(row)
+        self.published += 1
+
+    def _local_covariance(self, row: np.void) -> np.ndarray:
+        """Covariance (6, 6) of the pose in odom: what was gathered since its start; tilt is that of the estimate."""
+        covariance = np.diag([float(row["local_position_variance"])] * 3 + [0.0] * 3)
+        covariance[3:, 3:] = row["pose_covariance"][3:, 3:]
+        covariance[5, :] = covariance[:, 5] = 0.0
+        covariance[5, 5] = row["local_heading_variance"]
+        if self._two_d:
+            flatten_covariance(covariance)
+        return covariance
+
+    def _writer(self, frame: str, child_frame: str) -> AnyOdometryWriter:
+        try:
+            return OdometryWriter(frame, child_frame)
+        except LayoutError as error:
+            self._node.get_logger().warn(f"{error}; publishing through message objects, which costs more")
+            return OdometryMessageWriter(frame, child_frame)
+
+    def _open_transforms(self, parameters: Parameters) -> TransformOutput | None:
+        mode = parameters.output.tf
+        if mode == "none":
+            return None
+        if transforms.TFMessage is None:
+            self._node.get_logger().warn(
+                f"output.tf is {mode}, but the package tf2_msgs is not there: no transforms are published "
+                "(install ros-jazzy-tf2-msgs, or set output.tf to none)"
+            )
+            return None
+        # What tf2's own broadcaster does: no more than volatile and reliable.
+        publisher: Any = self._node.create_publisher(transforms.TFMessage, "/tf", OUTPUT_QOS)
+        return TransformOutput(mode, parameters.frames, publisher.publish)

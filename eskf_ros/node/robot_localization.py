@@ -1,0 +1,87 @@
+"""The services of robot_localization under their usual names, where that package is installed.
+
+navsat_transform's fromLL, toLL and datum, and the filter's set_pose: what was written for them goes on working.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from rclpy.node import Node
+
+from eskf_ros.filter.navigator import Navigator
+from eskf_ros.node.transforms import yaw_of
+from eskf_ros.simulate.map_frame import MapFrame
+
+try:
+    from robot_localization import srv as services
+except ImportError:
+    services = None
+
+
+class RobotLocalizationServices:
+    """Serves FromLL, ToLL, SetDatum and SetPose for a navigator. Made only where `services` is not None.
+
+    The responses carry no success flag: where there is no answer yet the numbers are NaN, and the log says why.
+    """
+
+    def __init__(self, node: Node, navigator: Navigator) -> None:
+        self._node = node
+        self._navigator = navigator
+        node.create_service(services.FromLL, "fromLL", self._from_geodetic)
+        node.create_service(services.ToLL, "toLL", self._to_geodetic)
+        node.create_service(services.SetDatum, "datum", self._set_datum)
+        node.create_service(services.SetPose, "set_pose", self._set_pose)
+
+    def _from_geodetic(self, request: Any, response: Any) -> Any:
+        point = request.ll_point
+        position = (math.nan,) * 3
+        datum = self._navigator.datum
+        if datum is None:
+            self._node.get_logger().warn("fromLL: the origin of the map is not known yet; NaN returned")
+        else:
+            place = MapFrame(datum).from_geodetic_deg(point.latitude, point.longitude, point.altitude)
+            position = tuple(place.tolist())
+        response.map_point.x, response.map_point.y, response.map_point.z = position
+        return response
+
+    def _to_geodetic(self, request: Any, response: Any) -> Any:
+        point = request.map_point
+        place = (math.nan,) * 3
+        datum = self._navigator.datum
+        if datum is None:
+            self._node.get_logger().warn("toLL: the origin of the map is not known yet; NaN returned")
+        else:
+            place = MapFrame(datum).to_geodetic_deg(np.array([point.x, point.y, point.z]))
+        response.ll_point.latitude, response.ll_point.longitude, response.ll_point.altitude = place
+        return response
+
+    def _set_datum(self, request: Any, response: Any) -> Any:
+        place = request.geo_pose.position
+        if abs(place.latitude) <= 90.0 and abs(place.longitude) <= 360.0 and math.isfinite(place.altitude):
+            self._navigator.set_datum(place.latitude, place.longitude, place.altitude)
+        else:
+            self._node.get_logger().error(f"datum: {place.latitude}, {place.longitude}, {place.altitude} is no place")
+        return response
+
+    def _set_pose(self, request: Any, response: Any) -> Any:
+        pose = request.pose.pose
+        why = set_pose(self._navigator, pose)
+        if why:
+            self._node.get_logger().error(f"set_pose: {why}")
+        return response
+
+
+def set_pose(navigator: Navigator, pose: Any) -> str:
+    """Put the estimate to a geometry_msgs/PoseWithCovariance in map; returns why not, or nothing."""
+    p, q = pose.pose.position, pose.pose.orientation
+    covariance = np.reshape(pose.covariance, (6, 6))
+    numbers = [p.x, p.y, p.z, q.w, q.x, q.y, q.z]
+    variances = np.diagonal(covariance)[[0, 1, 2, 5]]
+    if not np.isfinite(numbers).all() or not np.isfinite(covariance).all() or (variances <= 0.0).any():
+        return "the pose is not finite, or its covariance has no positive variance for x, y, z and yaw"
+    if navigator.set_pose((p.x, p.y, p.z), covariance[:3, :3], yaw_of(q.w, q.x, q.y, q.z), math.sqrt(variances[3])):
+        return ""
+    return "the robot is not levelled yet, or the origin of the map is not known"
