@@ -2,7 +2,7 @@
 
 While the heading is unknown its error has the variance of a half turn and is not estimated: GNSS moves position and
 velocity only (``strapdown.step`` cuts the coupling), the gyros carry the attitude. Every still window until the
-heading is known levels again.
+heading is known levels again; once GNSS is there, only one in which a fix agrees that it is still.
 """
 
 from __future__ import annotations
@@ -177,6 +177,9 @@ def watch_stillness(state, settings):
         return
     still = is_still(state, settings) and state.motion_stamp < state.window_start and is_same_rest(state)
     watch_input(state, still, settings)
+    if state.position_known == 1 and state.last_fix_stamp < state.window_start:
+        # Without a fix since it began nobody knows whether a slow acceleration passes for a tilt.
+        still = False
     if not still:
         state.still_count = 0
     else:
