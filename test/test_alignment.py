@@ -23,7 +23,7 @@ from scipy.stats import chi2
 
 from eskf_ros.filter import alignment
 from eskf_ros.filter.aiding import gnss_position
-from eskf_ros.filter.layout import blank_state
+from eskf_ros.filter.layout import AID, NEVER, allocate, blank_state
 from eskf_ros.filter.strapdown import gravity_map
 
 Array = NDArray[np.float64]
@@ -409,6 +409,47 @@ def test_restart_under_way_does_not_know_the_heading_of_the_start() -> None:
     state["stamp"] += 6_000_000_000
     watch(state, settings, 2.5, force, rate)
     assert state["heading_known"] == 0 or state["covariance"][8, 8] > 0.5
+
+
+def distrusting(robots: int, std: float, speed: float = 0.0) -> int:
+    """Return how many robots, level and waiting for a heading, lose their level to 20 s of fixes at 5 Hz.
+
+    Fixes scatter by ``std`` (m) on each axis and move at ``speed`` (m/s); a still window has just passed every 2 s.
+    """
+    rng = np.random.default_rng(7)
+    settings = make_settings()
+    aid = allocate(AID)[0]
+    found = 0
+    for _ in range(robots):
+        state = make_state()
+        state["heading_known"] = 0
+        for epoch in range(100):
+            seconds = 0.2 * epoch
+            east, north, up = std * rng.normal(size=3)
+            latitude = math.radians(DATUM[0]) + (north + speed * seconds) / 6.378e6
+            longitude = math.radians(DATUM[1]) + east / (6.378e6 * math.cos(latitude))
+            aid["stamp"] = round(seconds * 1e9)
+            aid["payload"] = (latitude, longitude, DATUM[2] + up, std**2, 0.0, 0.0, std**2, 0.0, std**2)
+            alignment.note_position(state, aid, settings)
+            if state["motion_stamp"] > 0 and state["still_stamp"] == NEVER:
+                found += 1
+                break
+            if epoch % 10 == 0:
+                state["still_stamp"] = aid["stamp"]
+                state["anchor_stamp"], state["anchor_ecef"] = state["last_fix_stamp"], state["last_fix_ecef"]
+    return found
+
+
+@pytest.mark.parametrize("std", [1.0, 20.0])
+def test_the_scatter_of_fixes_takes_no_level_away(std: float) -> None:
+    """At most one parked robot in a hundred; with three sigma, which a norm of three exceeds often, it is 17 or 67."""
+    assert distrusting(200, std) <= 2
+
+
+@pytest.mark.parametrize(("std", "speed"), [(0.02, 6.5), (1.0, 15.0)])
+def test_fixes_that_move_take_a_false_level_away(std: float, speed: float) -> None:
+    """No robot can have stood still within the last 2 s: what felt like rest was an even drive."""
+    assert distrusting(20, std, speed) == 20
 
 
 def test_first_fix_starts_the_position() -> None:

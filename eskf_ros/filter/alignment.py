@@ -33,7 +33,12 @@ from eskf_ros.rotation import (
 START_POSITION_STD = 1000.0
 START_VELOCITY_STD = 100.0
 MOVING_SPEED = 0.5
-"""What GNSS has to exceed by three sigma (m/s) to prove motion."""
+POSITION_SIGMAS = 5.0
+VELOCITY_SIGMAS = 3.0
+"""What GNSS has to exceed (m/s) by so many sigma to prove motion.
+
+Fixes are differenced, and over fractions of a second: at three sigma the noise of a parked robot's often passes.
+"""
 
 REST_TOLERANCE = 0.2
 """Change of the mean specific force across the vertical (m/s2) that a robot at rest may show: settling springs."""
@@ -207,7 +212,8 @@ def note_position(state, aid, settings):
         step = (fix[0] - a[0], fix[1] - a[1], fix[2] - a[2])
         std = math.sqrt(2.0 * max(aid.payload[3], aid.payload[6], aid.payload[8]))
         seconds = (aid.stamp - state.anchor_stamp) * 1e-9
-        note_speed(state, (math.sqrt(dot(step, step)) - 3.0 * std) / seconds, state.anchor_stamp, aid.stamp, settings)
+        speed = (math.sqrt(dot(step, step)) - POSITION_SIGMAS * std) / seconds
+        note_speed(state, speed, state.anchor_stamp, aid.stamp, settings)
     state.last_fix_stamp = aid.stamp
     for i in range(3):
         state.last_fix_ecef[i] = fix[i]
@@ -218,12 +224,12 @@ def note_velocity(state, aid, settings):
     """Look at a GNSS velocity."""
     speed = math.sqrt(aid.payload[0] ** 2 + aid.payload[1] ** 2 + aid.payload[2] ** 2)
     std = math.sqrt(max(aid.payload[3], aid.payload[6], aid.payload[8]))
-    note_speed(state, speed - 3.0 * std, aid.stamp, aid.stamp, settings)
+    note_speed(state, speed - VELOCITY_SIGMAS * std, aid.stamp, aid.stamp, settings)
 
 
 @njit
 def note_speed(state, speed, since, stamp, settings):
-    """Take a speed (m/s) that three sigma leave, the mean from ``since`` to ``stamp``, as proof of motion.
+    """Take a speed (m/s) that its noise leaves, the mean from ``since`` to ``stamp``, as proof of motion.
 
     If no robot can have gathered that speed since the last window that passed as still, that window was none.
     """
