@@ -33,9 +33,13 @@ LEVER_ARM = {"gnss__lever_arm": [0.8, -0.2, 1.4]}
 NOISE = {
     "imu__accel_bias_std": 0.02,
     "imu__accel_noise_density": 2e-3,
+    "imu__accel_bias_random_walk": 2e-3,
     "imu__gyro_bias_std": 1e-3,
     "imu__gyro_noise_density": 5e-5,
+    "imu__gyro_bias_random_walk": 5e-5,
 }
+"""White noise and walk of the bias weigh about the same in the mean of two seconds."""
+
 DATUM = (48.137, 11.575, 565.0)
 RATE_HZ = 100.0
 COUNT = 200
@@ -61,6 +65,14 @@ def at_rest(state: Any, attitude: Rotation, accel_bias: Any, gyro_bias: Any) -> 
 
 def level(state: Any, force: Array, rate: Array, settings: Any, still: bool = True) -> None:
     alignment.level(state, COUNT * np.concatenate([force, rate]), COUNT, 1.0 / RATE_HZ, still, settings)
+
+
+def mean_noise(rng: np.random.Generator, settings: Any, sensor: str) -> Array:
+    """Draw the difference of the mean reading from the bias at its end: white noise, and a bias that walks."""
+    steps = settings[f"{sensor}_bias_random_walk"] / math.sqrt(RATE_HZ) * rng.normal(size=(COUNT, 3))
+    walk = np.cumsum(steps, axis=0)
+    white = settings[f"{sensor}_noise_density"] / math.sqrt(COUNT / RATE_HZ) * rng.normal(size=3)
+    return np.asarray(walk.mean(axis=0) - walk[-1] + white)
 
 
 def tilt_error(state: Any, attitude: Rotation) -> Array:
@@ -119,14 +131,13 @@ def test_level_draws_match_their_covariance() -> None:
     """Tilt and accelerometer bias jointly: with a wrong sign or no cross covariance the figure explodes."""
     settings = make_settings(**NOISE)
     rng = np.random.default_rng(1)
-    mean_std = settings["accel_noise_density"] / math.sqrt(COUNT / RATE_HZ)
     joint, tilt_only = [], []
     for draw in range(DRAWS):
         attitude = Rotation.random(random_state=draw)
         bias = rng.normal(0.0, settings["accel_bias_std"], 3)
         state = fresh()
         force, rate = at_rest(state, attitude, bias, np.zeros(3))
-        level(state, force + rng.normal(0.0, mean_std, 3), rate, settings)
+        level(state, force + mean_noise(rng, settings, "accel"), rate, settings)
         chosen = [6, 7, 9, 10, 11]
         covariance = state["covariance"][np.ix_(chosen, chosen)]
         assert np.linalg.eigvalsh(covariance).min() > 0.0
@@ -164,7 +175,8 @@ def test_gyro_bias_is_the_bayesian_posterior(seed: int, case: str) -> None:
         level(state, force, rate, settings)
 
     earth_rate = 7.292115e-5
-    white = settings["gyro_noise_density"] ** 2 / (COUNT / RATE_HZ) * np.eye(3)
+    duration = COUNT / RATE_HZ
+    noise = settings["gyro_noise_density"] ** 2 / duration + settings["gyro_bias_random_walk"] ** 2 * duration / 3.0
     to_body = to_rotation(state["attitude"]).inv().as_matrix()
     up = np.array(alignment.local_up(state))
     earth = np.array(state["earth_rate_map"])
@@ -178,7 +190,7 @@ def test_gyro_bias_is_the_bayesian_posterior(seed: int, case: str) -> None:
         known, unknown = earth, square * across * settings["initial_heading_std"] ** 2
     elif case == "moving":
         unknown = 1e12 * np.eye(3)
-    mean, covariance = bayes(rate, to_body @ known, 1e-8, white + to_body @ unknown @ to_body.T)
+    mean, covariance = bayes(rate, to_body @ known, 1e-8, noise * np.eye(3) + to_body @ unknown @ to_body.T)
     np.testing.assert_allclose(state["gyro_bias"], mean, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(state["covariance"][12:, 12:], covariance, rtol=0.0, atol=1e-13)
 
@@ -194,8 +206,7 @@ def test_gyro_bias_draws_are_within_their_covariance(gyro_bias_std: float) -> No
         bias = rng.normal(0.0, gyro_bias_std, 3)
         state = fresh()
         force, rate = at_rest(state, attitude, np.zeros(3), bias)
-        rate = rate + rng.normal(0.0, settings["gyro_noise_density"] / math.sqrt(COUNT / RATE_HZ), 3)
-        level(state, force, rate, settings)
+        level(state, force, rate + mean_noise(rng, settings, "gyro"), settings)
         to_map = to_rotation(state["attitude"]).as_matrix()
         error = to_map @ (bias - state["gyro_bias"])
         covariance = to_map @ state["covariance"][12:, 12:] @ to_map.T
@@ -260,7 +271,6 @@ def test_level_and_heading_draws_match_their_covariance() -> None:
     )
     mount = Rotation.from_euler("xyz", MOUNT["imu__mount_rpy_deg"], degrees=True)
     rng = np.random.default_rng(6)
-    mean_std = settings["accel_noise_density"] / math.sqrt(COUNT / RATE_HZ)
     squares = []
     for _ in range(DRAWS):
         heading = 70.0 + 2.0 * rng.normal()
@@ -268,7 +278,7 @@ def test_level_and_heading_draws_match_their_covariance() -> None:
         bias = rng.normal(0.0, settings["accel_bias_std"], 3)
         state = fresh()
         force, rate = at_rest(state, attitude, bias, np.zeros(3))
-        level(state, force + rng.normal(0.0, mean_std, 3), rate, settings)
+        level(state, force + mean_noise(rng, settings, "accel"), rate, settings)
         assert state["heading_known"] == 1
         theta = (attitude * to_rotation(state["attitude"]).inv()).as_rotvec()
         error = np.concatenate([theta, bias])

@@ -296,7 +296,8 @@ def level(state, sums, count, interval, still, settings):
     """Set roll, pitch and, at rest, the gyro bias from mean readings; heading stays as it was.
 
     ``sums`` of force (m/s2) and rate (rad/s) over ``count`` samples ``interval`` s apart. The accelerometer bias
-    tilts the result, theta = up x (R dba) / g: the cross covariance says so (Groves, section 5.6.2).
+    tilts the result, theta = up x (R dba) / g: the cross covariance says so (Groves, section 5.6.2). A bias that walks
+    differs at the end from its mean by a third of the variance that it walks meanwhile.
     """
     force = (sums[0] / count, sums[1] / count, sums[2] / count)
     strength = math.sqrt(dot(force, force))
@@ -314,8 +315,10 @@ def level(state, sums, count, interval, still, settings):
             covariance[i, j] = 0.0
             covariance[j, i] = 0.0
     accel_bias_variance = settings.accel_bias_std**2
+    duration = count * interval
     if still:
-        tilt_noise = settings.accel_noise_density**2 / (count * interval) / strength**2
+        walked = settings.accel_bias_random_walk**2 * duration / 3.0
+        tilt_noise = (settings.accel_noise_density**2 / duration + walked) / strength**2
     else:
         turn_rate_square = (sums[3] ** 2 + sums[4] ** 2 + sums[5] ** 2) / count**2
         tilt_noise = settings.moving_tilt_std**2 + turn_rate_square * (UNKNOWN_SPEED / strength) ** 2
@@ -337,9 +340,8 @@ def level(state, sums, count, interval, still, settings):
             covariance[ATTITUDE + i, ATTITUDE + j] = (
                 horizontal * (accel_bias_variance / strength**2 + tilt_noise) + up[i] * up[j] * heading_variance
             )
-    set_gyro_bias(
-        state, (sums[3] / count, sums[4] / count, sums[5] / count), rotation, up, count * interval, still, settings
-    )
+    mean_rate = (sums[3] / count, sums[4] / count, sums[5] / count)
+    set_gyro_bias(state, mean_rate, rotation, up, duration, still, settings)
     # The parameter is true of the start only, not of where a restart finds the robot.
     if state.level_known == 0 and state.restarts == 0 and not math.isnan(settings.initial_heading):
         state.heading_known = 1
@@ -356,7 +358,7 @@ def set_gyro_bias(state, mean_rate, rotation, up, duration, still, settings):
     heading only the vertical part of the Earth rate is known.
     """
     prior = settings.gyro_bias_std**2
-    noise = settings.gyro_noise_density**2 / duration
+    noise = settings.gyro_noise_density**2 / duration + settings.gyro_bias_random_walk**2 * duration / 3.0
     earth = state.earth_rate_map
     vertical_rate = dot(up, earth)
     horizontal_square = dot(earth, earth) - vertical_rate**2
