@@ -23,7 +23,7 @@ from scipy.stats import chi2
 
 from eskf_ros.filter import alignment
 from eskf_ros.filter.aiding import gnss_position
-from eskf_ros.filter.layout import blank_state
+from eskf_ros.filter.layout import AID, NEVER, allocate, blank_state
 from eskf_ros.filter.strapdown import gravity_map
 
 Array = NDArray[np.float64]
@@ -33,9 +33,13 @@ LEVER_ARM = {"gnss__lever_arm": [0.8, -0.2, 1.4]}
 NOISE = {
     "imu__accel_bias_std": 0.02,
     "imu__accel_noise_density": 2e-3,
+    "imu__accel_bias_random_walk": 2e-3,
     "imu__gyro_bias_std": 1e-3,
     "imu__gyro_noise_density": 5e-5,
+    "imu__gyro_bias_random_walk": 5e-5,
 }
+"""White noise and walk of the bias weigh about the same in the mean of two seconds."""
+
 DATUM = (48.137, 11.575, 565.0)
 RATE_HZ = 100.0
 COUNT = 200
@@ -61,6 +65,14 @@ def at_rest(state: Any, attitude: Rotation, accel_bias: Any, gyro_bias: Any) -> 
 
 def level(state: Any, force: Array, rate: Array, settings: Any, still: bool = True) -> None:
     alignment.level(state, COUNT * np.concatenate([force, rate]), COUNT, 1.0 / RATE_HZ, still, settings)
+
+
+def mean_noise(rng: np.random.Generator, settings: Any, sensor: str) -> Array:
+    """Draw the difference of the mean reading from the bias at its end: white noise, and a bias that walks."""
+    steps = settings[f"{sensor}_bias_random_walk"] / math.sqrt(RATE_HZ) * rng.normal(size=(COUNT, 3))
+    walk = np.cumsum(steps, axis=0)
+    white = settings[f"{sensor}_noise_density"] / math.sqrt(COUNT / RATE_HZ) * rng.normal(size=3)
+    return np.asarray(walk.mean(axis=0) - walk[-1] + white)
 
 
 def tilt_error(state: Any, attitude: Rotation) -> Array:
@@ -119,14 +131,13 @@ def test_level_draws_match_their_covariance() -> None:
     """Tilt and accelerometer bias jointly: with a wrong sign or no cross covariance the figure explodes."""
     settings = make_settings(**NOISE)
     rng = np.random.default_rng(1)
-    mean_std = settings["accel_noise_density"] / math.sqrt(COUNT / RATE_HZ)
     joint, tilt_only = [], []
     for draw in range(DRAWS):
         attitude = Rotation.random(random_state=draw)
         bias = rng.normal(0.0, settings["accel_bias_std"], 3)
         state = fresh()
         force, rate = at_rest(state, attitude, bias, np.zeros(3))
-        level(state, force + rng.normal(0.0, mean_std, 3), rate, settings)
+        level(state, force + mean_noise(rng, settings, "accel"), rate, settings)
         chosen = [6, 7, 9, 10, 11]
         covariance = state["covariance"][np.ix_(chosen, chosen)]
         assert np.linalg.eigvalsh(covariance).min() > 0.0
@@ -164,7 +175,8 @@ def test_gyro_bias_is_the_bayesian_posterior(seed: int, case: str) -> None:
         level(state, force, rate, settings)
 
     earth_rate = 7.292115e-5
-    white = settings["gyro_noise_density"] ** 2 / (COUNT / RATE_HZ) * np.eye(3)
+    duration = COUNT / RATE_HZ
+    noise = settings["gyro_noise_density"] ** 2 / duration + settings["gyro_bias_random_walk"] ** 2 * duration / 3.0
     to_body = to_rotation(state["attitude"]).inv().as_matrix()
     up = np.array(alignment.local_up(state))
     earth = np.array(state["earth_rate_map"])
@@ -178,7 +190,7 @@ def test_gyro_bias_is_the_bayesian_posterior(seed: int, case: str) -> None:
         known, unknown = earth, square * across * settings["initial_heading_std"] ** 2
     elif case == "moving":
         unknown = 1e12 * np.eye(3)
-    mean, covariance = bayes(rate, to_body @ known, 1e-8, white + to_body @ unknown @ to_body.T)
+    mean, covariance = bayes(rate, to_body @ known, 1e-8, noise * np.eye(3) + to_body @ unknown @ to_body.T)
     np.testing.assert_allclose(state["gyro_bias"], mean, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(state["covariance"][12:, 12:], covariance, rtol=0.0, atol=1e-13)
 
@@ -194,8 +206,7 @@ def test_gyro_bias_draws_are_within_their_covariance(gyro_bias_std: float) -> No
         bias = rng.normal(0.0, gyro_bias_std, 3)
         state = fresh()
         force, rate = at_rest(state, attitude, np.zeros(3), bias)
-        rate = rate + rng.normal(0.0, settings["gyro_noise_density"] / math.sqrt(COUNT / RATE_HZ), 3)
-        level(state, force, rate, settings)
+        level(state, force, rate + mean_noise(rng, settings, "gyro"), settings)
         to_map = to_rotation(state["attitude"]).as_matrix()
         error = to_map @ (bias - state["gyro_bias"])
         covariance = to_map @ state["covariance"][12:, 12:] @ to_map.T
@@ -260,7 +271,6 @@ def test_level_and_heading_draws_match_their_covariance() -> None:
     )
     mount = Rotation.from_euler("xyz", MOUNT["imu__mount_rpy_deg"], degrees=True)
     rng = np.random.default_rng(6)
-    mean_std = settings["accel_noise_density"] / math.sqrt(COUNT / RATE_HZ)
     squares = []
     for _ in range(DRAWS):
         heading = 70.0 + 2.0 * rng.normal()
@@ -268,7 +278,7 @@ def test_level_and_heading_draws_match_their_covariance() -> None:
         bias = rng.normal(0.0, settings["accel_bias_std"], 3)
         state = fresh()
         force, rate = at_rest(state, attitude, bias, np.zeros(3))
-        level(state, force + rng.normal(0.0, mean_std, 3), rate, settings)
+        level(state, force + mean_noise(rng, settings, "accel"), rate, settings)
         assert state["heading_known"] == 1
         theta = (attitude * to_rotation(state["attitude"]).inv()).as_rotvec()
         error = np.concatenate([theta, bias])
@@ -409,6 +419,47 @@ def test_restart_under_way_does_not_know_the_heading_of_the_start() -> None:
     state["stamp"] += 6_000_000_000
     watch(state, settings, 2.5, force, rate)
     assert state["heading_known"] == 0 or state["covariance"][8, 8] > 0.5
+
+
+def distrusting(robots: int, std: float, speed: float = 0.0) -> int:
+    """Return how many robots, level and waiting for a heading, lose their level to 20 s of fixes at 5 Hz.
+
+    Fixes scatter by ``std`` (m) on each axis and move at ``speed`` (m/s); a still window has just passed every 2 s.
+    """
+    rng = np.random.default_rng(7)
+    settings = make_settings()
+    aid = allocate(AID)[0]
+    found = 0
+    for _ in range(robots):
+        state = make_state()
+        state["heading_known"] = 0
+        for epoch in range(100):
+            seconds = 0.2 * epoch
+            east, north, up = std * rng.normal(size=3)
+            latitude = math.radians(DATUM[0]) + (north + speed * seconds) / 6.378e6
+            longitude = math.radians(DATUM[1]) + east / (6.378e6 * math.cos(latitude))
+            aid["stamp"] = round(seconds * 1e9)
+            aid["payload"] = (latitude, longitude, DATUM[2] + up, std**2, 0.0, 0.0, std**2, 0.0, std**2)
+            alignment.note_position(state, aid, settings)
+            if state["motion_stamp"] > 0 and state["still_stamp"] == NEVER:
+                found += 1
+                break
+            if epoch % 10 == 0:
+                state["still_stamp"] = aid["stamp"]
+                state["anchor_stamp"], state["anchor_ecef"] = state["last_fix_stamp"], state["last_fix_ecef"]
+    return found
+
+
+@pytest.mark.parametrize("std", [1.0, 20.0])
+def test_the_scatter_of_fixes_takes_no_level_away(std: float) -> None:
+    """At most one parked robot in a hundred; with three sigma, which a norm of three exceeds often, it is 17 or 67."""
+    assert distrusting(200, std) <= 2
+
+
+@pytest.mark.parametrize(("std", "speed"), [(0.02, 6.5), (1.0, 15.0)])
+def test_fixes_that_move_take_a_false_level_away(std: float, speed: float) -> None:
+    """No robot can have stood still within the last 2 s: what felt like rest was an even drive."""
+    assert distrusting(20, std, speed) == 20
 
 
 def test_first_fix_starts_the_position() -> None:

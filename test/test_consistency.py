@@ -123,18 +123,9 @@ def test_error_grows_with_the_time_between_fixes_as_the_covariance_says() -> Non
     assert errors[2] > 1.3 * errors[1]
 
 
-SLOWEST = pytest.param(
-    20.0,
-    marks=pytest.mark.xfail(
-        strict=True,
-        reason="slow acceleration is taken for tilt bit by bit, window by window, while no fix says whether it is rest",
-    ),
-)
-
-
-@pytest.mark.parametrize("interval", [5.0, 10.0, SLOWEST])
+@pytest.mark.parametrize("interval", [5.0, 10.0, 20.0])
 def test_rare_fixes_do_not_spoil_the_start(interval: float) -> None:
-    """The robot drives off between two fixes; what it feels then is not gravity."""
+    """The robot drives off between two fixes; what it feels then is not gravity, however slowly it gathers speed."""
     runs = ensemble("drive", range(6), interval=1.0, gnss_rate=1.0 / interval)
     settled = runs.seconds >= SETTLED
     assert runs.nees["all 15"][:, settled].mean() < 18.0

@@ -2,7 +2,7 @@
 
 While the heading is unknown its error has the variance of a half turn and is not estimated: GNSS moves position and
 velocity only (``strapdown.step`` cuts the coupling), the gyros carry the attitude. Every still window until the
-heading is known levels again.
+heading is known levels again; once GNSS is there, only one in which a fix agrees that it is still.
 """
 
 from __future__ import annotations
@@ -34,7 +34,12 @@ from eskf_ros.rotation import (
 START_POSITION_STD = 1000.0
 START_VELOCITY_STD = 100.0
 MOVING_SPEED = 0.5
-"""What GNSS has to exceed by three sigma (m/s) to prove motion."""
+POSITION_SIGMAS = 5.0
+VELOCITY_SIGMAS = 3.0
+"""What GNSS has to exceed (m/s) by so many sigma to prove motion.
+
+Fixes are differenced, and over fractions of a second: at three sigma the noise of a parked robot's often passes.
+"""
 
 REST_TOLERANCE = 0.2
 """Change of the mean specific force across the vertical (m/s2) that a robot at rest may show: settling springs."""
@@ -178,6 +183,9 @@ def watch_stillness(state, settings):
         return
     still = is_still(state, settings) and state.motion_stamp < state.window_start and is_same_rest(state)
     watch_input(state, still, settings)
+    if state.position_known == 1 and state.last_fix_stamp < state.window_start:
+        # Without a fix since it began nobody knows whether a slow acceleration passes for a tilt.
+        still = False
     if not still:
         state.still_count = 0
     else:
@@ -205,7 +213,8 @@ def note_position(state, aid, settings):
         step = (fix[0] - a[0], fix[1] - a[1], fix[2] - a[2])
         std = math.sqrt(2.0 * max(aid.payload[3], aid.payload[6], aid.payload[8]))
         seconds = (aid.stamp - state.anchor_stamp) * 1e-9
-        note_speed(state, (math.sqrt(dot(step, step)) - 3.0 * std) / seconds, state.anchor_stamp, aid.stamp, settings)
+        speed = (math.sqrt(dot(step, step)) - POSITION_SIGMAS * std) / seconds
+        note_speed(state, speed, state.anchor_stamp, aid.stamp, settings)
     state.last_fix_stamp = aid.stamp
     for i in range(3):
         state.last_fix_ecef[i] = fix[i]
@@ -216,12 +225,12 @@ def note_velocity(state, aid, settings):
     """Look at a GNSS velocity."""
     speed = math.sqrt(aid.payload[0] ** 2 + aid.payload[1] ** 2 + aid.payload[2] ** 2)
     std = math.sqrt(max(aid.payload[3], aid.payload[6], aid.payload[8]))
-    note_speed(state, speed - 3.0 * std, aid.stamp, aid.stamp, settings)
+    note_speed(state, speed - VELOCITY_SIGMAS * std, aid.stamp, aid.stamp, settings)
 
 
 @njit
 def note_speed(state, speed, since, stamp, settings):
-    """Take a speed (m/s) that three sigma leave, the mean from ``since`` to ``stamp``, as proof of motion.
+    """Take a speed (m/s) that its noise leaves, the mean from ``since`` to ``stamp``, as proof of motion.
 
     If no robot can have gathered that speed since the last window that passed as still, that window was none.
     """
@@ -288,15 +297,17 @@ def level(state, sums, count, interval, still, settings):
     """Set roll, pitch and, at rest, the gyro bias from mean readings; heading stays as it was.
 
     ``sums`` of force (m/s2) and rate (rad/s) over ``count`` samples ``interval`` s apart. The accelerometer bias
-    tilts the result, theta = up x (R dba) / g: the cross covariance says so (Groves, section 5.6.2).
+    tilts the result, theta = up x (R dba) / g: the cross covariance says so (Groves, section 5.6.2). A bias that walks
+    differs at the end from its mean by a third of the variance that it walks meanwhile.
     """
     force = (sums[0] / count, sums[1] / count, sums[2] / count)
     rate = (sums[3] / count, sums[4] / count, sums[5] / count)
+    duration = count * interval
     bias = (0.0, 0.0, 0.0)
     accel_bias_variance = settings.accel_bias_std**2
     start_rate = (0.0, 0.0, 0.0)
     gyro_bias_variance = settings.gyro_bias_std**2
-    if do_biases_hold(state, force, rate, count * interval, still, settings):
+    if do_biases_hold(state, force, rate, duration, still, settings):
         b, r = settings.remembered_accel_bias, settings.remembered_gyro_bias
         bias, start_rate = (b[0], b[1], b[2]), (r[0], r[1], r[2])
         accel_bias_variance = settings.remembered_accel_bias_std**2
@@ -317,7 +328,8 @@ def level(state, sums, count, interval, still, settings):
             covariance[i, j] = 0.0
             covariance[j, i] = 0.0
     if still:
-        tilt_noise = settings.accel_noise_density**2 / (count * interval) / strength**2
+        walked = settings.accel_bias_random_walk**2 * duration / 3.0
+        tilt_noise = (settings.accel_noise_density**2 / duration + walked) / strength**2
     else:
         turn_rate_square = (sums[3] ** 2 + sums[4] ** 2 + sums[5] ** 2) / count**2
         tilt_noise = settings.moving_tilt_std**2 + turn_rate_square * (UNKNOWN_SPEED / strength) ** 2
@@ -339,7 +351,7 @@ def level(state, sums, count, interval, still, settings):
             covariance[ATTITUDE + i, ATTITUDE + j] = (
                 horizontal * (accel_bias_variance / strength**2 + tilt_noise) + up[i] * up[j] * heading_variance
             )
-    set_gyro_bias(state, start_rate, gyro_bias_variance, rate, rotation, up, count * interval, still, settings)
+    set_gyro_bias(state, start_rate, gyro_bias_variance, rate, rotation, up, duration, still, settings)
     # The parameter is true of the start only, not of where a restart finds the robot.
     if state.level_known == 0 and state.restarts == 0 and not math.isnan(settings.initial_heading):
         state.heading_known = 1
@@ -355,7 +367,7 @@ def set_gyro_bias(state, prior_bias, prior, mean_rate, rotation, up, duration, s
     The prior (``prior_bias``, rad/s, IMU axes, with variance ``prior``) and the mean are weighed along the vertical
     and across it, because without heading only the vertical part of the Earth rate is known.
     """
-    noise = settings.gyro_noise_density**2 / duration
+    noise = settings.gyro_noise_density**2 / duration + settings.gyro_bias_random_walk**2 * duration / 3.0
     earth = state.earth_rate_map
     vertical_rate = dot(up, earth)
     horizontal_square = dot(earth, earth) - vertical_rate**2
