@@ -4,30 +4,18 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from ros_process import Process, Ros, needs_ros
+from robot import CONFIG, ROOT, TYPES, Robot, read_drive, stamp_of, start_node
+from ros_process import Ros, needs_ros
 
-from eskf_ros.bags import encode, open_bag
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.parameters import load
 
 pytestmark = needs_ros
 
-ROOT = Path(__file__).resolve().parents[1]
-CONFIG = ROOT / "config" / "tunnel_drive.yaml"
-TYPES = {
-    "imu/data": "sensor_msgs/msg/Imu",
-    "gps/fix": "sensor_msgs/msg/NavSatFix",
-    "gps/vel": "geometry_msgs/msg/TwistWithCovarianceStamped",
-}
-SECONDS = 32.0
-SPEED = 4.0
 RELIABLE = tuple(
     word for topic in TYPES for word in ("-p", f"qos_overrides./{topic}.subscription.reliability:=reliable")
 )
@@ -42,15 +30,7 @@ def ros() -> Iterator[Ros]:
 
 @pytest.fixture(scope="module")
 def drive() -> list[tuple[int, str, bytes]]:
-    """The first part of the bundled recording: log time, topic, serialised message, in recorded order."""
-    with open_bag([ROOT / "bags" / "tunnel_drive.mcap"]) as reader:
-        end = reader.start_time + round(SECONDS * 1e9)
-        found = []
-        for batch in reader.batches(TYPES):
-            for topic, part in batch.items():
-                rows = encode(TYPES[topic], part.messages, part.strings)
-                found += [(int(t), topic, bytes(row)) for t, row in zip(part.log_time, rows) if t < end]
-    return sorted(found)
+    return read_drive()
 
 
 def last_imu_last(drive: list[tuple[int, str, bytes]]) -> list[tuple[int, str, bytes]]:
@@ -83,58 +63,6 @@ def replayed(drive) -> tuple[Navigator, np.ndarray]:
             covariance = np.reshape(m.twist.covariance, (6, 6))[:3, :3].ravel()
             navigator.push_gnss_velocity(stamp_of(m), (v.x, v.y, v.z), covariance)
     return navigator, rows[0]
-
-
-def stamp_of(message: Any) -> int:
-    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-
-
-class Robot:
-    """Publishes the drive and listens to the node."""
-
-    def __init__(self, ros: Ros, prefix: str = "") -> None:
-        from diagnostic_msgs.msg import DiagnosticArray
-        from geometry_msgs.msg import TwistWithCovarianceStamped
-        from nav_msgs.msg import Odometry
-        from rclpy.qos import QoSProfile
-        from sensor_msgs.msg import Imu, NavSatFix
-
-        self.ros = ros
-        self.odometry: dict[str, list[Any]] = {"odometry/global": [], "odometry/local": []}
-        self.diagnostics: list[Any] = []
-        classes = {"imu/data": Imu, "gps/fix": NavSatFix, "gps/vel": TwistWithCovarianceStamped}
-        qos = QoSProfile(depth=10_000)
-        self.publishers = {
-            topic: ros.node.create_publisher(kind, prefix + topic, qos) for topic, kind in classes.items()
-        }
-        self.subscriptions = [
-            ros.node.create_subscription(Odometry, prefix + topic, self.odometry[topic].append, qos)
-            for topic in self.odometry
-        ]
-        self.subscriptions.append(
-            ros.node.create_subscription(DiagnosticArray, "/diagnostics", self.diagnostics.append, qos)
-        )
-
-    def wait_for_node(self) -> None:
-        def is_ready() -> bool:
-            return bool(self.diagnostics) and all(p.get_subscription_count() for p in self.publishers.values())
-
-        self.ros.until(is_ready, 90.0, "the node to subscribe and to report")
-
-    def play(self, drive: list[tuple[int, str, bytes]], speed: float = SPEED) -> None:
-        """Publish in recorded order and time; the last IMU sample waits until all others have arrived."""
-        start, begin = drive[0][0], time.monotonic()
-        for log_time, topic, data in drive:
-            while time.monotonic() - begin < (log_time - start) * 1e-9 / speed:
-                self.ros.spin_once(0.0005)
-            self.publishers[topic].publish(data)
-
-    def say(self) -> str:
-        return self.diagnostics[-1].status[0].message if self.diagnostics else ""
-
-
-def start_node(ros: Ros, *arguments: str) -> Process:
-    return ros.spawn([sys.executable, "-m", "eskf_ros.node.main", "--ros-args", *arguments])
 
 
 def test_the_node_ends_where_the_replay_ends_bit_for_bit(ros, drive, replayed):
