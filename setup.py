@@ -20,6 +20,7 @@ setup(
         (f"share/{package_name}", ["package.xml"]),
         (f"share/{package_name}/config", sorted(glob("config/*.yaml"))),
         (f"share/{package_name}/bags", sorted(glob("bags/*.mcap"))),
+        (f"share/{package_name}/launch", sorted(glob("launch/*.launch.py"))),
     ],
     python_requires=">=3.10",
     install_requires=[

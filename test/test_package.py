@@ -18,17 +18,22 @@ import eskf_ros
 CHECKOUT = Path(__file__).resolve().parent.parent
 # Import name -> name in package indices, where they differ.
 DISTRIBUTIONS = {"yaml": "pyyaml", "ruamel": "ruamel.yaml"}
-# ROS packages: rosdep keys by their own name; from PyPI they come with the extra [ros].
+# ROS packages: rosdep keys by their own name; those that are on PyPI come with the extra [ros].
 ROS_PACKAGES = {
     "builtin_interfaces",
     "diagnostic_msgs",
     "geometry_msgs",
+    "launch",
+    "launch_ros",
     "nav_msgs",
     "rcl_interfaces",
     "rclpy",
     "sensor_msgs",
     "std_srvs",
+    "tf2_msgs",
 }
+# Used where somebody else has installed it.
+OPTIONAL = {"robot_localization"}
 # Import name -> rosdep key that brings it, where it is not python3-NAME.
 ROSDEP_KEYS = {
     "lz4": "mcap-ros2-support",
@@ -60,15 +65,15 @@ PACKAGE_XML = xml.etree.ElementTree.parse(CHECKOUT / "package.xml").getroot()
 
 
 def third_party_imports() -> set[str]:
-    """Top-level names of everything imported in the package that neither Python nor the package itself brings."""
+    """Top-level names of all that the package and its launch files import, but for Python's and the package's own."""
     names: set[str] = set()
-    for path in (CHECKOUT / "eskf_ros").rglob("*.py"):
+    for path in [*(CHECKOUT / "eskf_ros").rglob("*.py"), *(CHECKOUT / "launch").glob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Import):
                 names |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
                 names.add(node.module.split(".")[0])
-    return names - set(sys.stdlib_module_names) - {"eskf_ros"}
+    return names - set(sys.stdlib_module_names) - OPTIONAL - {"eskf_ros"}
 
 
 def test_one_version_everywhere() -> None:
@@ -99,8 +104,9 @@ def test_names_and_licence_agree() -> None:
 def test_every_import_is_declared_for_pip_and_for_rosdep() -> None:
     required = {re.split(r"[<>=\[; ]", line)[0] for line in SETUP["install_requires"]}  # type: ignore[attr-defined]
     keys = {element.text for element in PACKAGE_XML.findall("exec_depend")}
-    assert keys >= ROS_PACKAGES
-    for name in third_party_imports() - ROS_PACKAGES:
+    imported = third_party_imports()
+    assert keys >= ROS_PACKAGES <= imported
+    for name in imported - ROS_PACKAGES:
         assert DISTRIBUTIONS.get(name, name) in required, f"{name} is imported, but setup.py does not require it"
         key = ROSDEP_KEYS.get(name, f"python3-{name}")
         assert key in keys, f"{name} is imported, but package.xml has no exec_depend {key}"
@@ -123,10 +129,12 @@ def test_commands_start_and_explain_themselves(line: str) -> None:
 
 
 def test_installed_files_exist() -> None:
-    for folder in ("config", "bags"):
+    for folder in ("config", "bags", "launch"):
         assert f"glob('{folder}/*" in str(SETUP["data_files"])
     assert (CHECKOUT / "config" / "eskf.yaml").is_file()
     assert (CHECKOUT / "config" / "tunnel_drive.yaml").is_file()
+    assert (CHECKOUT / "launch" / "eskf.launch.py").is_file()
+    assert (CHECKOUT / "launch" / "replay.launch.py").is_file()
     for path in re.findall(r"'([^'*]+\.(?:xml|yaml|mcap))'", str(SETUP["data_files"])):
         assert (CHECKOUT / path).is_file()
 
