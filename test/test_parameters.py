@@ -116,6 +116,8 @@ def values_of(leaf: Leaf) -> st.SearchStrategy[Value]:
             exclude_max=rule.below is not None,
         )
 
+    if leaf.kind == "integer":
+        return st.integers(rule.minimum, rule.maximum)
     if leaf.kind == "float":
         return number(0) | st.just(math.nan) if rule.nan_allowed else number(0)
     return st.sampled_from(rule.lengths).flatmap(lambda count: st.tuples(*(number(i) for i in range(count))))
@@ -169,6 +171,10 @@ def test_mapping_reads_back_the_same(parameters: Parameters) -> None:
             "/map",
             "'/map' is not allowed here, it takes a frame name without blanks and without a leading",
         ),
+        ("output.rate_divisor", 2.0, "2.0 is not allowed here, it takes a whole number 1 to 1000"),
+        ("output.rate_divisor", 0, "0 is not allowed here, it takes a whole number 1 to 1000"),
+        ("output.rate_divisor", True, "True is not allowed here, it takes a whole number 1 to 1000"),
+        ("output.tf", "map", "'map' is not allowed here, it takes full or map_to_odom or none"),
         ("gnss.lever_am", [0, 0, 0], "unknown parameter (value [0, 0, 0]); did you mean gnss.lever_arm?"),
         ("lever_arm", [0, 0, 0], "unknown parameter (value [0, 0, 0]); did you mean gnss.lever_arm?"),
         ("history.lever_arm", 1, "unknown parameter (value 1); did you mean gnss.lever_arm?"),
