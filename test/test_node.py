@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
 from robot import CONFIG, ROOT, TYPES, Robot, read_drive, stamp_of, start_node
 from ros_process import Ros, needs_ros
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
 
-from eskf_ros.filter.navigator import Navigator
-from eskf_ros.parameters import load
+from eskf_ros.bags import open_bag
+from eskf_ros.replay.main import main as replay
 
 pytestmark = needs_ros
 
-RELIABLE = tuple(
-    word for topic in TYPES for word in ("-p", f"qos_overrides./{topic}.subscription.reliability:=reliable")
+LOSSLESS = tuple(
+    word
+    for end in (*(f"{topic}.subscription" for topic in TYPES), "odometry/global.publisher", "odometry/local.publisher")
+    for policy in ("reliability:=reliable", "depth:=100000")
+    for word in ("-p", f"qos_overrides./{end}.{policy}")
 )
 """For the comparison to the bit no message may get lost on a busy machine."""
 
@@ -40,56 +47,49 @@ def last_imu_last(drive: list[tuple[int, str, bytes]]) -> list[tuple[int, str, b
 
 
 @pytest.fixture(scope="module")
-def replayed(drive) -> tuple[Navigator, np.ndarray]:
-    """The same messages through the estimator without ROS: the navigator, and the row of the last IMU sample."""
-    from geometry_msgs.msg import TwistWithCovarianceStamped
-    from rclpy.serialization import deserialize_message
-    from sensor_msgs.msg import Imu, NavSatFix
-
-    navigator = Navigator(load(CONFIG))
-    for _, topic, data in last_imu_last(drive):
-        if topic == "imu/data":
-            m = deserialize_message(data, Imu)
-            a, w = m.linear_acceleration, m.angular_velocity
-            rows = navigator.push_imu(np.array([stamp_of(m)]), np.array([[a.x, a.y, a.z]]), np.array([[w.x, w.y, w.z]]))
-        elif topic == "gps/fix":
-            m = deserialize_message(data, NavSatFix)
-            navigator.push_gnss_position(
-                stamp_of(m), m.latitude, m.longitude, m.altitude, m.position_covariance, m.position_covariance_type, 0
-            )
-        else:
-            m = deserialize_message(data, TwistWithCovarianceStamped)
-            v = m.twist.twist.linear
-            covariance = np.reshape(m.twist.covariance, (6, 6))[:3, :3].ravel()
-            navigator.push_gnss_velocity(stamp_of(m), (v.x, v.y, v.z), covariance)
-    return navigator, rows[0]
+def replayed(drive, tmp_path_factory) -> tuple[dict[str, Any], np.void]:
+    """What `eskf_replay` makes of a bag of these messages: its summary, and its last odometry message."""
+    folder = tmp_path_factory.mktemp("replayed")
+    types = get_typestore(Stores.ROS2_JAZZY)
+    with Writer(folder / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connections = {topic: writer.add_connection(topic, kind, typestore=types) for topic, kind in TYPES.items()}
+        # The order of log times is the order of arrival.
+        for log_time, (_, topic, data) in enumerate(last_imu_last(drive), drive[0][0]):
+            writer.write(connections[topic], log_time, data)
+    words = [str(folder / "bag"), "--config", str(CONFIG), "--out", str(folder), "--output-rate", "0", "--quiet"]
+    assert replay(words) == 0
+    with open_bag([folder / "bag_eskf" / "odometry.mcap"]) as reader:
+        for batch in reader.batches({"odometry/global": "nav_msgs/msg/Odometry"}):
+            last = batch["odometry/global"].messages[-1]
+    return json.loads((folder / "bag_eskf" / "summary.json").read_text()), last
 
 
 def test_the_node_ends_where_the_replay_ends_bit_for_bit(ros, drive, replayed):
-    """Every IMU sample has its odometry, and the last one is that of the replay."""
-    node = start_node(ros, "--params-file", str(CONFIG), *RELIABLE)
+    """Every IMU sample has its odometry, and the last one is that of `eskf_replay` for a bag of the same messages."""
+    node = start_node(ros, "--params-file", str(CONFIG), *LOSSLESS)
     robot = Robot(ros)
     robot.wait_for_node()
     *before, last = last_imu_last(drive)
     robot.play(before)
-    navigator, row = replayed
+    summary, expected = replayed
     for _ in range(50):
         ros.spin_once(0.02)
     robot.publishers["imu/data"].publish(last[2])
-    ros.until(
-        lambda: robot.odometry["odometry/global"] and stamp_of(robot.odometry["odometry/global"][-1]) == row["stamp"]
-    )
-    message = robot.odometry["odometry/global"][-1]
+    odometry = robot.odometry["odometry/global"]
+    ros.until(lambda: odometry and stamp_of(odometry[-1]) == expected["stamp"], what="odometry of the last sample")
+    message = odometry[-1]
     p, q = message.pose.pose.position, message.pose.pose.orientation
-    assert [p.x, p.y, p.z] == row["position_map"].tolist()
-    assert [q.w, q.x, q.y, q.z] == row["attitude_body_to_map"].tolist()
-    assert message.pose.covariance.tolist() == row["pose_covariance"].ravel().tolist()
-    assert message.twist.covariance.tolist() == row["twist_covariance"].ravel().tolist()
+    v, w = message.twist.twist.linear, message.twist.twist.angular
+    assert [p.x, p.y, p.z] == expected["position"].tolist() == summary["final"]["position"]
+    assert [q.x, q.y, q.z, q.w] == expected["orientation"].tolist()
+    assert [v.x, v.y, v.z] == expected["linear_velocity"].tolist()
+    assert [w.x, w.y, w.z] == expected["angular_velocity"].tolist()
+    assert message.pose.covariance.tolist() == expected["pose_covariance"].ravel().tolist()
+    assert message.twist.covariance.tolist() == expected["twist_covariance"].ravel().tolist()
     stamps = [stamp_of(m) for m in robot.odometry["odometry/local"]]
-    imu = navigator.imu_counts["offered"]
     assert stamps == sorted(set(stamps))
     # All but those before the attitude is level, in the first two seconds.
-    assert imu - 2.1 * 200 <= len(stamps) <= imu
+    assert summary["imu_count"] - 2.1 * 200 <= len(stamps) <= summary["imu_count"]
     assert node.stop() == 0
     assert "Traceback" not in node.output
 

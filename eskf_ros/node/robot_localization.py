@@ -6,6 +6,7 @@ navsat_transform's fromLL, toLL and datum, and the filter's set_pose: what was w
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -30,10 +31,25 @@ class RobotLocalizationServices:
     def __init__(self, node: Node, navigator: Navigator) -> None:
         self._node = node
         self._navigator = navigator
-        node.create_service(services.FromLL, "fromLL", self._from_geodetic)
-        node.create_service(services.ToLL, "toLL", self._to_geodetic)
-        node.create_service(services.SetDatum, "datum", self._set_datum)
-        node.create_service(services.SetPose, "set_pose", self._set_pose)
+        for kind, name, answer in (
+            (services.FromLL, "fromLL", self._from_geodetic),
+            (services.ToLL, "toLL", self._to_geodetic),
+            (services.SetDatum, "datum", self._set_datum),
+            (services.SetPose, "set_pose", self._set_pose),
+        ):
+            node.create_service(kind, name, self._contained(name, answer))
+
+    def _contained(self, name: str, answer: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+        """No request ends the node."""
+
+        def contain(request: Any, response: Any) -> Any:
+            try:
+                return answer(request, response)
+            except Exception as error:
+                self._node.get_logger().error(f"{name}: {type(error).__name__}: {error}")
+                return response
+
+        return contain
 
     def _from_geodetic(self, request: Any, response: Any) -> Any:
         point = request.ll_point
