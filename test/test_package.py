@@ -147,7 +147,7 @@ def test_files_the_commands_of_run_need() -> None:
         assert (CHECKOUT / path).is_file(), f"run names {path}"
 
 
-@pytest.mark.parametrize("path", ["run", ".ci/run"])
+@pytest.mark.parametrize("path", ["run", ".ci/run", ".ci/colcon"])
 def test_scripts_are_executable(path: str) -> None:
     assert (CHECKOUT / path).stat().st_mode & 0o111
     subprocess.run(["bash", "-n", CHECKOUT / path], check=True)
