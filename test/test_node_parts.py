@@ -21,8 +21,11 @@ from hypothesis import strategies as st
 from ros_process import Ros, free_domain, needs_ros
 
 import eskf_ros
+from eskf_ros.filter.layout import ODOMETRY, allocate
 from eskf_ros.node.cdr import ImuReader, LayoutError, OdometryMessageWriter, OdometryWriter, imu_from_message
 from eskf_ros.node.clocks import Stamp, StampMonitor, clock_complaints
+from eskf_ros.node.odometry import fill_odometry
+from eskf_ros.node.planar import PLANAR_VARIANCE
 from eskf_ros.parameters import ParameterError, Parameters, leaves, to_mapping, to_yaml
 
 SECOND = 1_000_000_000
@@ -173,30 +176,22 @@ SHARED_READER = ImuReader()
 """One for all examples: what an earlier message left behind must not harm a later one."""
 
 
-def odometry_values(seed: int = 3) -> dict[str, Any]:
-    generator = np.random.default_rng(seed)
-    return {
-        "stamp": 1_700_000_001_000_000_007,
-        "position": tuple(generator.normal(size=3).tolist()),
-        "quaternion": tuple(generator.normal(size=4).tolist()),
-        "pose_covariance": generator.normal(size=(6, 6)),
-        "linear_velocity": tuple(generator.normal(size=3).tolist()),
-        "angular_velocity": tuple(generator.normal(size=3).tolist()),
-        "twist_covariance": generator.normal(size=(6, 6)),
-    }
+STAMP = 1_700_000_001_000_000_007
 
 
-def check_odometry(message: Any, frame: str, child: str, values: dict[str, Any]) -> None:
+def odometry_numbers(seed: int = 3) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=85)
+
+
+def check_odometry(message: Any, frame: str, child: str, numbers: np.ndarray) -> None:
     pose, twist = message.pose.pose, message.twist.twist
-    assert message.header.stamp.sec * SECOND + message.header.stamp.nanosec == values["stamp"]
+    assert message.header.stamp.sec * SECOND + message.header.stamp.nanosec == STAMP
     assert (message.header.frame_id, message.child_frame_id) == (frame, child)
-    assert (pose.position.x, pose.position.y, pose.position.z) == values["position"]
-    quaternion = (pose.orientation.w, pose.orientation.x, pose.orientation.y, pose.orientation.z)
-    assert quaternion == values["quaternion"]
-    assert (twist.linear.x, twist.linear.y, twist.linear.z) == values["linear_velocity"]
-    assert (twist.angular.x, twist.angular.y, twist.angular.z) == values["angular_velocity"]
-    assert np.array_equal(message.pose.covariance, values["pose_covariance"].ravel())
-    assert np.array_equal(message.twist.covariance, values["twist_covariance"].ravel())
+    p, q, v, w = pose.position, pose.orientation, twist.linear, twist.angular
+    assert [p.x, p.y, p.z, q.x, q.y, q.z, q.w] == numbers[:7].tolist()
+    assert message.pose.covariance.tolist() == numbers[7:43].tolist()
+    assert [v.x, v.y, v.z, w.x, w.y, w.z] == numbers[43:49].tolist()
+    assert message.twist.covariance.tolist() == numbers[49:].tolist()
 
 
 @needs_ros
@@ -206,11 +201,11 @@ def test_odometry_writer_writes_what_the_message_library_reads() -> None:
 
     children = FRAMES[::2]
     for seed, (frame, child) in enumerate((frame, child) for frame in FRAMES for child in children):
-        values = odometry_values(seed)
-        data = OdometryWriter(frame, child).write(**values)
+        numbers = odometry_numbers(seed)
+        data = OdometryWriter(frame, child).write(STAMP, numbers)
         assert type(data) is bytes  # publish() takes nothing else
         message = deserialize_message(data, Odometry)
-        check_odometry(message, frame, child, values)
+        check_odometry(message, frame, child, numbers)
         assert len(serialize_message(message)) == len(data)
 
 
@@ -220,20 +215,44 @@ def test_odometry_writer_keeps_nothing_of_earlier_messages() -> None:
     from rclpy.serialization import deserialize_message
 
     writer = OdometryWriter("odom", "base_link")
-    first = writer.write(**odometry_values(1))
+    first = writer.write(STAMP + 1, odometry_numbers(1))
     kept = bytes(first)
-    values = odometry_values(2)
-    transposed = np.asfortranarray(values["pose_covariance"])
-    second = writer.write(**{**values, "pose_covariance": transposed, "position": np.array(values["position"])})
+    second = writer.write(STAMP, odometry_numbers(2))
     assert first == kept
-    check_odometry(deserialize_message(second, Odometry), "odom", "base_link", values)
+    check_odometry(deserialize_message(second, Odometry), "odom", "base_link", odometry_numbers(2))
 
 
 @needs_ros
 def test_odometry_by_message_is_the_same() -> None:
-    values = odometry_values()
-    arrays = {name: np.array(value) if isinstance(value, tuple) else value for name, value in values.items()}
-    check_odometry(OdometryMessageWriter("odom", "base_link").write(**arrays), "odom", "base_link", values)
+    numbers = odometry_numbers()
+    message = OdometryMessageWriter("odom", "base_link").write(STAMP, numbers)
+    check_odometry(message, "odom", "base_link", numbers)
+    numbers[:] = 0.0  # the next row is written to the same place
+    check_odometry(message, "odom", "base_link", odometry_numbers())
+
+
+@pytest.mark.parametrize("is_planar", [False, True])
+def test_rows_become_the_numbers_of_both_messages(is_planar: bool) -> None:
+    generator = np.random.default_rng(1)
+    rows = allocate(ODOMETRY, 2)
+    row = rows[1]
+    for name in ODOMETRY.names or ():
+        if ODOMETRY[name].base.kind == "f":
+            row[name] = generator.normal(size=ODOMETRY[name].shape)
+    numbers = np.full((2, 85), np.nan)
+    assert fill_odometry(rows, 1, is_planar, numbers)
+    twist = [*row["velocity_body"], *row["angular_rate_body"], *row["twist_covariance"].ravel()]
+    local = np.zeros((6, 6))
+    local[[0, 1, 2], [0, 1, 2]] = row["local_position_variance"]
+    local[3:5, 3:5] = row["pose_covariance"][3:5, 3:5]
+    local[5, 5] = row["local_heading_variance"]
+    if is_planar:
+        local[2, 2] = PLANAR_VARIANCE
+    for found, frame, covariance in zip(numbers, ("map", "odom"), (row["pose_covariance"], local)):
+        attitude = row[f"attitude_body_to_{frame}"][[1, 2, 3, 0]]
+        assert found.tolist() == [*row[f"position_{frame}"], *attitude, *covariance.ravel(), *twist]
+    row["twist_covariance"][5, 0] = math.inf
+    assert not fill_odometry(rows, 1, is_planar, numbers)
 
 
 @needs_ros
@@ -591,7 +610,8 @@ class Echo(Node):
         stamp, force, rate, frame = self.reader.read(data)
         if force[0] == 666.0:
             raise ValueError("a mistake in a callback")
-        self.output.publish(self.writer.write(stamp, force, (1.0, 0.0, 0.0, 0.0), np.eye(6), rate, rate, np.eye(6)))
+        numbers = [*force, 0.0, 0.0, 0.0, 1.0, *np.eye(6).ravel(), *rate, *rate, *np.eye(6).ravel()]
+        self.output.publish(self.writer.write(stamp, np.array(numbers)))
 
     def close(self):
         print("closed", self.context.ok(), flush=True)

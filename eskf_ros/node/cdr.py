@@ -10,7 +10,6 @@ machine of today sends; the classes with `message` in their name do the rest the
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, Protocol
 
@@ -101,16 +100,7 @@ def imu_from_message(message: Any) -> ImuSample:
 class AnyOdometryWriter(Protocol):
     """What `publisher.publish` takes for one odometry: made by either of the two writers below."""
 
-    def write(
-        self,
-        stamp: int,
-        position: Sequence[float],
-        quaternion: Sequence[float],
-        pose_covariance: NDArray[np.float64],
-        linear_velocity: Sequence[float],
-        angular_velocity: Sequence[float],
-        twist_covariance: NDArray[np.float64],
-    ) -> Any: ...
+    def write(self, stamp: int, numbers: NDArray[np.float64]) -> Any: ...
 
 
 class OdometryWriter:
@@ -131,38 +121,18 @@ class OdometryWriter:
         struct.pack_into("<I8x", self._buffer, 0, _LITTLE_ENDIAN_CDR)
         self._buffer[12 : 12 + len(frames)] = frames
         self._pack_stamp = struct.Struct("<iI").pack_into
-        self._pack_pose = struct.Struct("<7d").pack_into
-        self._pack_twist = struct.Struct("<6d").pack_into
-        self._pose_at = doubles
-        self._twist_at = doubles + 8 * (7 + 36)
-        self._pose_covariance = np.ndarray((6, 6), "<f8", self._buffer, doubles + 8 * 7)
-        self._twist_covariance = np.ndarray((6, 6), "<f8", self._buffer, self._twist_at + 8 * 6)
+        self._numbers = memoryview(self._buffer)[doubles:]
         self._verify(frame_id, child_frame_id)
 
-    def write(
-        self,
-        stamp: int,
-        position: Sequence[float],
-        quaternion: Sequence[float],
-        pose_covariance: NDArray[np.float64],
-        linear_velocity: Sequence[float],
-        angular_velocity: Sequence[float],
-        twist_covariance: NDArray[np.float64],
-    ) -> bytes:
-        """One serialised Odometry.
+    def write(self, stamp: int, numbers: NDArray[np.float64]) -> bytes:
+        """One serialised Odometry: `stamp` in ns, `numbers` (85,) contiguous and in the order of the message.
 
-        `stamp` in ns; `position` (3,) m and `quaternion` (4,) w x y z of the child frame in the frame; velocities (3,)
-        m/s and rad/s in the child frame; covariances (6, 6) in the order of the message. Vectors as tuples or lists
-        (`.tolist()`): arrays work too, but take three times as long.
+        That is position x y z (m), orientation x y z w of the child frame in the frame, covariance of the pose (36),
+        linear (m/s) and angular velocity (rad/s) in the child frame, covariance of the twist (36).
         """
-        buffer = self._buffer
-        w, x, y, z = quaternion
-        self._pack_stamp(buffer, 4, *divmod(stamp, 1_000_000_000))
-        self._pack_pose(buffer, self._pose_at, *position, x, y, z, w)
-        self._pose_covariance[:] = pose_covariance
-        self._pack_twist(buffer, self._twist_at, *linear_velocity, *angular_velocity)
-        self._twist_covariance[:] = twist_covariance
-        return bytes(buffer)
+        self._pack_stamp(self._buffer, 4, *divmod(stamp, 1_000_000_000))
+        self._numbers[:] = numbers.view(np.uint8).data
+        return bytes(self._buffer)
 
     def _verify(self, frame_id: str, child_frame_id: str) -> None:
         """Write a different number to every place and compare what the message library reads with it."""
@@ -170,18 +140,7 @@ class OdometryWriter:
         from rclpy.serialization import deserialize_message
 
         numbers = np.arange(1.0, 1.0 + _ODOMETRY_DOUBLES)
-        position, (x, y, z, w), pose_covariance, linear, angular, twist_covariance = np.split(
-            numbers, np.cumsum([3, 4, 36, 3, 3])
-        )
-        data = self.write(
-            1_000_000_002,
-            position,
-            (w, x, y, z),
-            pose_covariance.reshape(6, 6),
-            linear,
-            angular,
-            twist_covariance.reshape(6, 6),
-        )
+        data = self.write(1_000_000_002, numbers)
         try:
             message = deserialize_message(data, Odometry)
             stamp, pose, twist = message.header.stamp, message.pose, message.twist
@@ -211,16 +170,7 @@ class OdometryMessageWriter:
         self._frame_id = frame_id
         self._child_frame_id = child_frame_id
 
-    def write(
-        self,
-        stamp: int,
-        position: Sequence[float],
-        quaternion: Sequence[float],
-        pose_covariance: NDArray[np.float64],
-        linear_velocity: Sequence[float],
-        angular_velocity: Sequence[float],
-        twist_covariance: NDArray[np.float64],
-    ) -> Any:
+    def write(self, stamp: int, numbers: NDArray[np.float64]) -> Any:
         """One nav_msgs/Odometry; arguments as in `OdometryWriter.write`.
 
         The setters of rclpy do not check: everything but a Python float, or a flat float64 array, becomes garbage.
@@ -230,15 +180,11 @@ class OdometryMessageWriter:
         message.header.frame_id = self._frame_id
         message.child_frame_id = self._child_frame_id
         pose, twist = message.pose.pose, message.twist.twist
-        pose.position.x, pose.position.y, pose.position.z = map(float, position)
+        pose.position.x, pose.position.y, pose.position.z = numbers[:3].tolist()
         orientation = pose.orientation
-        orientation.w, orientation.x, orientation.y, orientation.z = map(float, quaternion)
-        twist.linear.x, twist.linear.y, twist.linear.z = map(float, linear_velocity)
-        twist.angular.x, twist.angular.y, twist.angular.z = map(float, angular_velocity)
-        message.pose.covariance = _flat(pose_covariance)
-        message.twist.covariance = _flat(twist_covariance)
+        orientation.x, orientation.y, orientation.z, orientation.w = numbers[3:7].tolist()
+        message.pose.covariance = numbers[7:43].copy()
+        twist.linear.x, twist.linear.y, twist.linear.z = numbers[43:46].tolist()
+        twist.angular.x, twist.angular.y, twist.angular.z = numbers[46:49].tolist()
+        message.twist.covariance = numbers[49:].copy()
         return message
-
-
-def _flat(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(covariance, np.float64).reshape(36)

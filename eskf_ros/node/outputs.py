@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -12,9 +11,11 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
+from eskf_ros.filter.layout import ODOMETRY, allocate
 from eskf_ros.node import transforms
 from eskf_ros.node.cdr import AnyOdometryWriter, LayoutError, OdometryMessageWriter, OdometryWriter
-from eskf_ros.node.planar import flatten, flatten_covariance
+from eskf_ros.node.odometry import GLOBAL, LOCAL, NUMBERS, fill_odometry
+from eskf_ros.node.planar import flatten
 from eskf_ros.node.transforms import TransformOutput
 from eskf_ros.parameters import Parameters
 
@@ -36,6 +37,8 @@ class Outputs:
         self._two_d = parameters.output.two_d
         self._divisor = parameters.output.rate_divisor
         self._rows = 0
+        self._numbers = np.zeros((2, NUMBERS))
+        fill_odometry(allocate(ODOMETRY), 0, self._two_d, self._numbers)  # compiles it
         self.published = 0
         frames = parameters.frames
         self._global_writer = self._writer(frames.map, frames.base_link)
@@ -45,42 +48,24 @@ class Outputs:
         self.publishers = (self._global, self._local)
         self.transforms = self._open_transforms(parameters)
 
-    def publish(self, row: np.void) -> None:
-        """Publish one ODOMETRY row, which may be changed."""
+    def publish(self, rows: np.ndarray, index: int) -> None:
+        """Publish one of the ODOMETRY rows, which may be changed."""
         self._rows += 1
         if self._rows % self._divisor:
             return
+        row = rows[index]
         if self._two_d:
             flatten(row)
-        pose, twist = row["pose_covariance"], row["twist_covariance"]
-        velocity, rate = row["velocity_body"].tolist(), row["angular_rate_body"].tolist()
-        local_position, local_attitude = row["position_odom"].tolist(), row["attitude_body_to_odom"].tolist()
-        position, attitude = row["position_map"].tolist(), row["attitude_body_to_map"].tolist()
-        if not math.isfinite(
-            sum(velocity) + sum(rate) + sum(local_position) + sum(position) + sum(attitude) + pose.sum() + twist.sum()
-        ):
+        if not fill_odometry(rows, index, self._two_d, self._numbers):
             self._note_trouble("a result was not finite and was not published")
             return
         stamp = int(row["stamp"])
-        local_pose = self._local_covariance(row)
-        self._local.publish(
-            self._local_writer.write(stamp, local_position, local_attitude, local_pose, velocity, rate, twist)
-        )
+        self._local.publish(self._local_writer.write(stamp, self._numbers[LOCAL]))
         if row["position_known"]:
-            self._global.publish(self._global_writer.write(stamp, position, attitude, pose, velocity, rate, twist))
+            self._global.publish(self._global_writer.write(stamp, self._numbers[GLOBAL]))
         if self.transforms is not None:
             self.transforms.send(row)
         self.published += 1
-
-    def _local_covariance(self, row: np.void) -> np.ndarray:
-        """Covariance (6, 6) of the pose in odom: what was gathered since its start; tilt is that of the estimate."""
-        covariance = np.diag([float(row["local_position_variance"])] * 3 + [0.0] * 3)
-        covariance[3:, 3:] = row["pose_covariance"][3:, 3:]
-        covariance[5, :] = covariance[:, 5] = 0.0
-        covariance[5, 5] = row["local_heading_variance"]
-        if self._two_d:
-            flatten_covariance(covariance)
-        return covariance
 
     def _writer(self, frame: str, child_frame: str) -> AnyOdometryWriter:
         try:

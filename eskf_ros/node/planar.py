@@ -26,11 +26,7 @@ def flatten(row: np.void) -> None:
     row["velocity_body"][2] = 0.0
     row["angular_rate_body"][:2] = 0.0
     for name in ("pose_covariance", "twist_covariance"):
-        flatten_covariance(row[name])
-
-
-def flatten_covariance(covariance: np.ndarray) -> None:
-    """Leave of a pose or twist covariance (6, 6) what belongs to x, y and yaw."""
-    covariance[PLANAR, :] = 0.0
-    covariance[:, PLANAR] = 0.0
-    covariance[PLANAR, PLANAR] = PLANAR_VARIANCE
+        covariance = row[name]
+        covariance[PLANAR, :] = 0.0
+        covariance[:, PLANAR] = 0.0
+        covariance[PLANAR, PLANAR] = PLANAR_VARIANCE
