@@ -13,7 +13,16 @@ from eskf_ros.compiled import njit
 from eskf_ros.earth import EARTH_RATE, STANDARD_GRAVITY, east_north_up_to_ecef, geodetic_to_ecef
 from eskf_ros.filter.aiding.gnss_position import position_of_fix
 from eskf_ros.filter.covariance import transform_error
-from eskf_ros.filter.layout import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, NEVER, POSITION, VELOCITY
+from eskf_ros.filter.layout import (
+    ACCEL_BIAS,
+    ATTITUDE,
+    ERROR_CAPACITY,
+    ERROR_SIZE,
+    GYRO_BIAS,
+    NEVER,
+    POSITION,
+    VELOCITY,
+)
 from eskf_ros.filter.monitors import watch_input
 from eskf_ros.filter.strapdown import gravity_map
 from eskf_ros.filter.warm_start import do_biases_hold
@@ -94,7 +103,7 @@ def turn_attitude(state, rotation_vector):
 
 
 @njit
-def move_datum(state, latitude, longitude, altitude):
+def move_datum(state, latitude, longitude, altitude, settings):
     """Describe the same state in the local frame of another datum (rad, rad, m): an exact rotation and shift."""
     old = east_north_up_to_ecef(state.datum[0], state.datum[1])
     offset = rotate(old, state.position_map)
@@ -113,6 +122,11 @@ def move_datum(state, latitude, longitude, altitude):
         state.velocity_map[i] = velocity[i]
     transform_error(state.covariance, POSITION, turn)
     transform_error(state.covariance, VELOCITY, turn)
+    place = settings.position_error_at
+    if place < state.error_size:
+        transform_error(state.covariance, place, turn)
+        lasting = state.optional[place - ERROR_SIZE : place - ERROR_SIZE + 3]
+        lasting[0], lasting[1], lasting[2] = rotate(turn, (lasting[0], lasting[1], lasting[2]))
     turn_attitude(state, to_rotation_vector(from_matrix(turn)))
 
 
@@ -251,7 +265,7 @@ def distrust_level(state, settings):
     covariance = state.covariance
     for i in range(3):
         state.gyro_bias[i] = 0.0
-        for j in range(ERROR_SIZE):
+        for j in range(ERROR_CAPACITY):
             covariance[GYRO_BIAS + i, j] = 0.0
             covariance[j, GYRO_BIAS + i] = 0.0
         for j in range(3):
@@ -324,7 +338,7 @@ def level(state, sums, count, interval, still, settings):
 
     covariance = state.covariance
     for i in range(ATTITUDE, ERROR_SIZE):
-        for j in range(ERROR_SIZE):
+        for j in range(ERROR_CAPACITY):
             covariance[i, j] = 0.0
             covariance[j, i] = 0.0
     if still:
@@ -419,7 +433,7 @@ def heading_of(state, settings):
 def set_heading(state, heading, std, settings):
     """Turn the attitude about the local vertical to ``heading`` (rad), independent of everything else by ``std``."""
     up = local_up(state)
-    lever = rotate(to_matrix(state.attitude), settings.lever_arm_body)
+    lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[0])
     change = heading - heading_of(state, settings)
     turn_attitude(state, (change * up[0], change * up[1], change * up[2]))
     covariance = state.covariance
@@ -434,7 +448,7 @@ def set_heading(state, heading, std, settings):
             covariance[ATTITUDE + i, ATTITUDE + j] += up[i] * up[j] * std**2
     if state.position_known == 1:
         # GNSS held the antenna in place: the body is on the other end of the lever arm.
-        turned = rotate(to_matrix(state.attitude), settings.lever_arm_body)
+        turned = rotate(to_matrix(state.attitude), settings.lever_arms_body[0])
         for i in range(3):
             state.position_map[i] += lever[i] - turned[i]
 
@@ -450,7 +464,7 @@ def start_position(state, payload):
     for i in range(3):
         state.position_map[i] = position[i]
         state.velocity_map[i] = 0.0
-        for j in range(ERROR_SIZE):
+        for j in range(ERROR_CAPACITY):
             covariance[POSITION + i, j] = 0.0
             covariance[j, POSITION + i] = 0.0
             covariance[VELOCITY + i, j] = 0.0
@@ -467,12 +481,12 @@ def place(state, position, position_covariance, heading, heading_std, settings):
     """Put base_link to a position (m, map) with a covariance (3, 3) and a heading (rad), whatever was known before."""
     covariance = state.covariance
     for i in range(3):
-        for j in range(ERROR_SIZE):
+        for j in range(ERROR_CAPACITY):
             covariance[POSITION + i, j] = 0.0
             covariance[j, POSITION + i] = 0.0
     if state.position_known == 0:
         for i in range(3):
-            for j in range(ERROR_SIZE):
+            for j in range(ERROR_CAPACITY):
                 covariance[VELOCITY + i, j] = 0.0
                 covariance[j, VELOCITY + i] = 0.0
             covariance[VELOCITY + i, VELOCITY + i] = START_VELOCITY_STD**2
@@ -530,7 +544,7 @@ def recall_heading(state, payload, settings):
     if settings.has_memory == 0 or state.restarts > 0 or state.heading_known == 1:
         return
     fix = geodetic_to_ecef(payload[0], payload[1], payload[2])
-    place, lever, mount = settings.remembered_place_ecef, settings.lever_arm_body, settings.imu_position_base
+    place, lever, mount = settings.remembered_place_ecef, settings.lever_arms_body[0], settings.imu_position_base
     way = (fix[0] - place[0], fix[1] - place[1], fix[2] - place[2])
     fix_std = math.sqrt(max(payload[3], payload[6], payload[8]))
     # The antenna is at most this far from base_link, on whatever side.

@@ -13,7 +13,9 @@ from __future__ import annotations
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import STANDARD_GRAVITY, normal_gravity_ecef
+from eskf_ros.filter import optional
 from eskf_ros.filter.covariance import add_noise, propagate_covariance
+from eskf_ros.filter.layout import ERROR_SIZE
 from eskf_ros.rotation import cross, dot, from_rotation_vector, multiply, normalized, rotate, rotate_back, to_matrix
 
 SECOND = 1_000_000_000
@@ -128,8 +130,11 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
     attitude = turned(attitude, angle, earth_rate, dt)
     for i in range(4):
         state.attitude[i] = attitude[i]
-    propagate_covariance(state.covariance, middle, force, gravity, earth_rate, dt, coupling, work)
+    size = state.error_size
+    propagate_covariance(state.covariance, size, middle, force, gravity, earth_rate, dt, coupling, work)
     add_noise(state.covariance, velocity_noise, attitude_noise, dt, settings)
+    if size > ERROR_SIZE:
+        optional.wander(state, dt, settings)
 
 
 @njit
