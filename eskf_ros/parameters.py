@@ -384,6 +384,21 @@ class Alignment:
     moving_tilt_std_deg: float = _parameter(
         5.0, "deg", "Standard deviation of roll and of pitch after levelling on the way.", above=0.0, maximum=90.0
     )
+    found_heading_std_deg: float = _parameter(
+        5.0,
+        "deg",
+        "An unknown heading is looked for by comparing the accelerations that the IMU and GNSS measure, in whatever "
+        "direction the vehicle moves. It counts as known when its standard deviation falls below this.",
+        above=0.0,
+        maximum=30.0,
+    )
+    use_course: bool = _parameter(
+        True,
+        "",
+        "For vehicles that travel along their x axis, forward or in reverse: take the course over ground as the "
+        "heading, once the accelerations have told it from reversing and side slip. false for what moves in any "
+        "direction (a multirotor, a vessel in the current, a walker with a hand-held IMU).",
+    )
     course_min_speed: float = _parameter(
         1.5,
         "m/s",

@@ -1,4 +1,4 @@
-"""Start-up: level from gravity, position from the first fix, heading from a parameter or from course over ground.
+"""Start-up: level from gravity, position from the first fix, heading from a parameter or from acceleration and course.
 
 While the heading is unknown its error has the variance of a half turn and is not estimated: GNSS moves position and
 velocity only (``strapdown.step`` cuts the coupling), the gyros carry the attitude. Every still window until the
@@ -11,8 +11,19 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import EARTH_RATE, STANDARD_GRAVITY, east_north_up_to_ecef, geodetic_to_ecef
+from eskf_ros.filter.aiding.common import set_east_north_up_covariance
 from eskf_ros.filter.aiding.gnss_position import position_of_fix
+from eskf_ros.filter.aiding.gnss_velocity import body_rate, local_east_north_up_to_ecef
 from eskf_ros.filter.covariance import transform_error
+from eskf_ros.filter.heading_search import (
+    COSINE,
+    begin_search,
+    forget_search,
+    note_level,
+    spread,
+    turn_found,
+    update_search,
+)
 from eskf_ros.filter.layout import (
     ACCEL_BIAS,
     ATTITUDE,
@@ -22,6 +33,7 @@ from eskf_ros.filter.layout import (
     NEVER,
     POSITION,
     VELOCITY,
+    Stream,
 )
 from eskf_ros.filter.monitors import watch_input
 from eskf_ros.filter.strapdown import gravity_map
@@ -39,6 +51,9 @@ from eskf_ros.rotation import (
     to_rotation_vector,
     wrapped,
 )
+
+GNSS_POSITION = int(Stream.GNSS_POSITION)
+GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
 
 START_POSITION_STD = 1000.0
 START_VELOCITY_STD = 100.0
@@ -62,6 +77,11 @@ UNKNOWN_SPEED = 10.0
 COURSE_MAX_STD = 0.17
 COURSE_MAX_TURN_RATE = 0.2
 """Course over ground gives heading only when it is this certain (rad) and the robot turns no faster (rad/s)."""
+
+CERTAIN = 3.0
+LEAST_LENGTH = 0.5
+COURSE_SEARCH_STD = 0.35
+"""The course is believed when the search agrees within three sigma, and knows the direction so well by itself (rad)."""
 
 MINIMUM_WINDOW_SAMPLES = 10
 
@@ -128,6 +148,7 @@ def move_datum(state, latitude, longitude, altitude, settings):
         lasting = state.optional[place - ERROR_SIZE : place - ERROR_SIZE + 3]
         lasting[0], lasting[1], lasting[2] = rotate(turn, (lasting[0], lasting[1], lasting[2]))
     turn_attitude(state, to_rotation_vector(from_matrix(turn)))
+    forget_search(state)
 
 
 @njit
@@ -154,6 +175,7 @@ def shortest_turn(a, b):
 def restart(state):
     """Start the alignment again; only the datum stays."""
     state.restarts += 1
+    forget_search(state)
     state.rejected_fixes = 0
     state.level_known = 0
     state.position_known = 0
@@ -261,6 +283,7 @@ def distrust_level(state, settings):
     """Give tilt and gyro bias the uncertainty of a level taken while moving."""
     state.still_stamp = NEVER
     state.still_count = 0
+    note_level(state, settings.moving_tilt_std**2)
     up = local_up(state)
     covariance = state.covariance
     for i in range(3):
@@ -347,6 +370,7 @@ def level(state, sums, count, interval, still, settings):
     else:
         turn_rate_square = (sums[3] ** 2 + sums[4] ** 2 + sums[5] ** 2) / count**2
         tilt_noise = settings.moving_tilt_std**2 + turn_rate_square * (UNKNOWN_SPEED / strength) ** 2
+    note_level(state, tilt_noise)
     heading_variance = math.pi**2
     if state.heading_known == 1:
         heading_variance = settings.initial_heading_std**2
@@ -491,6 +515,7 @@ def place(state, position, position_covariance, heading, heading_std, settings):
                 covariance[j, VELOCITY + i] = 0.0
             covariance[VELOCITY + i, VELOCITY + i] = START_VELOCITY_STD**2
     state.position_known = 0
+    forget_search(state)
     set_heading(state, heading, heading_std, settings)
     m = settings.imu_position_base
     offset = rotate(to_matrix(state.attitude), rotate_back(settings.imu_to_base, (m[0], m[1], m[2])))
@@ -503,11 +528,47 @@ def place(state, position, position_covariance, heading, heading_std, settings):
 
 
 @njit
+def search_heading(state, aid, gate, settings, work):
+    """Let a GNSS measurement that was fused take part in the search for the heading, and look whether it is over."""
+    rotation = to_matrix(state.attitude)
+    arm = settings.lever_arms_body[aid.source]
+    if aid.stream == GNSS_POSITION:
+        first = 0
+        measured = position_of_fix(state, aid.payload)
+        lever = rotate(rotation, arm)
+        local_to_ecef = east_north_up_to_ecef(aid.payload[0], aid.payload[1])
+    elif aid.stream == GNSS_VELOCITY:
+        first = 2
+        local_to_ecef = local_east_north_up_to_ecef(state)
+        velocity = rotate(local_to_ecef, (aid.payload[0], aid.payload[1], aid.payload[2]))
+        measured = rotate_back(state.map_to_ecef, velocity)
+        lever = rotate(rotation, cross(body_rate(state, rotation), arm))
+    else:
+        return
+    set_east_north_up_covariance(work.noise, state, local_to_ecef, aid.payload, 3)
+    if state.search_started == 1:
+        update_search(state, first, measured, lever, work.noise, gate, work)
+    elif first == 0:
+        reach = lever[0] ** 2 + lever[1] ** 2
+        begin_search(state, measured[0], measured[1], max(work.noise[0, 0], work.noise[1, 1]) + reach)
+    turn, std = turn_found(state)
+    if std <= settings.found_heading_std:
+        set_heading(state, heading_of(state, settings) + turn, std, settings)
+        state.heading_known = 1
+    elif settings.use_course == 1:
+        align_to_course(state, settings)
+
+
+@njit
 def align_to_course(state, settings):
-    """Take the unknown heading from the course, if that is certain and steady; the robot is driving forward."""
+    """Take the unknown heading from the course, if that is certain and steady and the search knows which end is ahead.
+
+    Accelerations tell forward from reverse, and side slip from driving straight, long before they tell the heading as
+    well as the course does.
+    """
     v = state.velocity_map
     speed = math.sqrt(v[0] ** 2 + v[1] ** 2)
-    if speed == 0.0:
+    if speed < settings.course_min_speed or state.search_started == 0:
         return
     along = (v[0] / speed, v[1] / speed)
     covariance = state.covariance
@@ -516,22 +577,30 @@ def align_to_course(state, settings):
     pyy = covariance[VELOCITY + 1, VELOCITY + 1]
     along_variance = along[0] ** 2 * pxx + 2.0 * along[0] * along[1] * pxy + along[1] ** 2 * pyy
     across_variance = along[1] ** 2 * pxx - 2.0 * along[0] * along[1] * pxy + along[0] ** 2 * pyy
-    course_variance = across_variance / speed**2
+    course_std = math.sqrt(max(across_variance, 0.0) / speed**2 + settings.course_std**2)
     up = local_up(state)
-    rate = (
-        state.angular_rate[0] - state.gyro_bias[0],
-        state.angular_rate[1] - state.gyro_bias[1],
-        state.angular_rate[2] - state.gyro_bias[2],
-    )
-    turn_rate = dot(up, rotate(to_matrix(state.attitude), rate))
+    turn_rate = dot(up, rotate(to_matrix(state.attitude), body_rate(state, to_matrix(state.attitude))))
     if (
-        speed < settings.course_min_speed
-        or course_variance > COURSE_MAX_STD**2
+        across_variance > (COURSE_MAX_STD * speed) ** 2
         or speed**2 < 9.0 * along_variance
         or abs(turn_rate) > COURSE_MAX_TURN_RATE
     ):
         return
-    set_heading(state, math.atan2(v[1], v[0]), math.sqrt(course_variance + settings.course_std**2), settings)
+    heading = math.atan2(v[1], v[0])
+    turn = heading - heading_of(state, settings)
+    cosine, sine = math.cos(turn), math.sin(turn)
+    ahead = cosine * state.search[COSINE] + sine * state.search[COSINE + 1]
+    aside = cosine * state.search[COSINE + 1] - sine * state.search[COSINE]
+    ahead_std, aside_std = spread(state, cosine, sine)
+    if (
+        abs(ahead) < max(CERTAIN * ahead_std, LEAST_LENGTH)
+        or aside_std > COURSE_SEARCH_STD * abs(ahead)
+        or abs(aside) > CERTAIN * math.hypot(aside_std, course_std * abs(ahead))
+    ):
+        return
+    if ahead < 0.0:
+        heading += math.pi
+    set_heading(state, heading, course_std, settings)
     state.heading_known = 1
 
 

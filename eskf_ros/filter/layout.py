@@ -35,6 +35,9 @@ NOWHERE = ERROR_CAPACITY
 SOURCES = 2
 """GNSS receivers with antennas of their own, by their index."""
 
+SEARCH_SIZE = 8
+"""States of the search for the heading (see ``heading_search``)."""
+
 NEVER = -(2**62)
 """Stamp before everything."""
 
@@ -129,6 +132,14 @@ STATE = np.dtype(
         ("position_known", "i8"),
         ("heading_known", "i8"),
         ("first_stamp", "i8"),
+        # Search for the heading: position, velocity, cosine and sine, acceleration error; tilt variance (rad2) apart
+        # from the accelerometer bias, seconds and radians turned since the last level.
+        ("search_started", "i8"),
+        ("search", "f8", (SEARCH_SIZE,)),
+        ("search_covariance", "f8", (SEARCH_SIZE, SEARCH_SIZE)),
+        ("search_tilt_variance", "f8"),
+        ("search_age", "f8"),
+        ("search_turn", "f8"),
         # External evidence of motion: when GNSS last proved it, the last fix, and the one the window started from.
         ("motion_stamp", "i8"),
         ("last_fix_stamp", "i8"),
@@ -253,6 +264,8 @@ SETTINGS = np.dtype(
         ("moving_tilt_std", "f8"),
         ("initial_heading", "f8"),
         ("initial_heading_std", "f8"),
+        ("use_course", "i8"),
+        ("found_heading_std", "f8"),
         ("course_min_speed", "f8"),
         ("course_std", "f8"),
         ("good_heading_std", "f8"),

@@ -14,7 +14,6 @@ from eskf_ros.compiled import njit
 from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
 from eskf_ros.filter.aiding import gnss_position, gnss_velocity
 from eskf_ros.filter.alignment import (
-    align_to_course,
     heading_of,
     move_datum,
     note_position,
@@ -22,6 +21,7 @@ from eskf_ros.filter.alignment import (
     place,
     recall_heading,
     restart,
+    search_heading,
     set_datum,
     start_position,
     watch_stillness,
@@ -200,7 +200,7 @@ def fuse(state, aids, i, settings, work):
         linearize(state, aid, settings, work)
         aid.verdict = update_weighed_down(state, size, aid.nis / gate, work)
     if aid.verdict == FUSED and state.heading_known == 0:
-        align_to_course(state, settings)
+        search_heading(state, aid, gate, settings, work)
     if aid.stream == GNSS_POSITION:
         judge_filter(state, aid.verdict)
     note_jump(state, position, heading, settings)
@@ -661,6 +661,8 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
     settings["moving_tilt_std"] = math.radians(alignment.moving_tilt_std_deg)
     settings["initial_heading"] = math.radians(alignment.initial_heading_deg)
     settings["initial_heading_std"] = math.radians(alignment.initial_heading_std_deg)
+    settings["use_course"] = alignment.use_course
+    settings["found_heading_std"] = math.radians(alignment.found_heading_std_deg)
     settings["course_min_speed"] = alignment.course_min_speed
     settings["course_std"] = math.radians(alignment.course_std_deg)
     settings["good_heading_std"] = math.radians(alignment.good_heading_std_deg)
