@@ -152,7 +152,7 @@ def run(recording: Recording, navigator: Navigator, interval: float = 0.5) -> Ru
         records.append(navigator.take_records())
         aligned.append(bool(state["heading_known"]))
         errors.append(state_error(recording, i, truth[k], state))
-        covariances.append(state["covariance"])
+        covariances.append(state["covariance"][:ERROR_SIZE, :ERROR_SIZE])
     records.append(navigator.finish())
     return Run(
         seconds=(stops + 1) / recording.options.imu_rate,

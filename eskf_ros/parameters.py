@@ -259,6 +259,23 @@ class Gnss:
         below=1.0,
         live=True,
     )
+    correlation_time: float = _parameter(
+        0.0,
+        "s",
+        "How long the error of a position lasts (e-folding time). 0: fixes err independently of each other. Those of a "
+        "receiver at several Hz do not, and the estimate then trusts their mean too much; without corrections 30 to "
+        "300 s is usual.",
+        minimum=0.0,
+        maximum=1.0e5,
+    )
+    correlated_share: float = _parameter(
+        0.8,
+        "",
+        "With a correlation_time: the share of the variance of each fix that lasts; the rest is new every time.",
+        above=0.0,
+        below=1.0,
+        live=True,
+    )
     status_std_horizontal: tuple[float, ...] = _parameter(
         (3.0, 2.0, 0.5),
         "m",
@@ -283,6 +300,32 @@ class Gnss:
         above=0.0,
         maximum=100.0,
         live=True,
+    )
+
+
+@dataclass(frozen=True)
+class SecondGnss:
+    frame_id: str = _parameter(
+        "",
+        "",
+        "Messages of topics.gnss_fix and topics.gnss_velocity with this frame are those of the second receiver. "
+        "Empty: there is one receiver.",
+        pattern=r"([^/\s]\S*)?",
+        pattern_text="empty, or a frame name without blanks and without a leading slash",
+    )
+    lever_arm: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0),
+        "m",
+        "Position of the second antenna in base_link, x forward, y left, z up.",
+        minimum=-1000.0,
+        maximum=1000.0,
+    )
+    time_offset: float = _parameter(
+        0.0,
+        "s",
+        "Added to the stamps of the second receiver's messages: true time = stamp + offset.",
+        minimum=-10.0,
+        maximum=10.0,
     )
 
 
@@ -340,6 +383,21 @@ class Alignment:
     )
     moving_tilt_std_deg: float = _parameter(
         5.0, "deg", "Standard deviation of roll and of pitch after levelling on the way.", above=0.0, maximum=90.0
+    )
+    found_heading_std_deg: float = _parameter(
+        5.0,
+        "deg",
+        "An unknown heading is looked for by comparing the accelerations that the IMU and GNSS measure, in whatever "
+        "direction the vehicle moves. It counts as known when its standard deviation falls below this.",
+        above=0.0,
+        maximum=30.0,
+    )
+    use_course: bool = _parameter(
+        True,
+        "",
+        "For vehicles that travel along their x axis, forward or in reverse: take the course over ground as the "
+        "heading, once the accelerations have told it from reversing and side slip. false for what moves in any "
+        "direction (a multirotor, a vessel in the current, a walker with a hand-held IMU).",
     )
     course_min_speed: float = _parameter(
         1.5,
@@ -436,6 +494,9 @@ class Parameters:
     )
     imu: Imu = _group(Imu, "Where the IMU sits and how good it is; biases and noise are in the axes of the IMU.")
     gnss: Gnss = _group(Gnss, "The GNSS receiver: where its antenna sits and how far its messages are trusted.")
+    second_gnss: SecondGnss = _group(
+        SecondGnss, "A second GNSS receiver with an antenna of its own; all else is as for the first."
+    )
     history: History = _group(History, "Late and out-of-order messages.")
     alignment: Alignment = _group(Alignment, "Start-up: levelling, heading, and when the estimate is called good.")
     warm_start: WarmStart = _group(WarmStart, "What the node remembers of its last run.")

@@ -80,6 +80,11 @@ def random_state(seed: int, far: float = 3000.0) -> Any:
     return state
 
 
+def core(state: Any) -> Array:
+    """Return the covariance of the 15 errors every robot has, as a view."""
+    return state["covariance"][:15, :15]  # type: ignore[no-any-return]
+
+
 def copy_of(state: Any) -> Any:
     """Return a record of its own with the same contents."""
     copy = layout.allocate(layout.STATE)

@@ -49,7 +49,7 @@ def numerical_jacobian(aid: ModuleType, state: Any, settings: Any) -> Array:
     jacobian = np.empty((3, 15))
     for j in range(15):
         error = PERTURBATION[j] * np.eye(15)[j]
-        plus, minus = (np.array(aid.predict(with_error(state, k * error), settings)) for k in (1.0, -1.0))
+        plus, minus = (np.array(aid.predict(with_error(state, k * error), 0, settings)) for k in (1.0, -1.0))
         jacobian[:, j] = (plus - minus) / (2.0 * PERTURBATION[j])
     return jacobian
 
@@ -65,10 +65,10 @@ def example(seed: int, far: float) -> tuple[Any, Array]:
 def test_jacobian_of_position(seed: int, far: float, settings: Any) -> None:
     state, covariance = example(seed, far)
     work = make_work()
-    assert gnss_position.linearize(state, payload_of(geodetic_of(state), covariance), settings, work) == 3
+    assert gnss_position.linearize(state, payload_of(geodetic_of(state), covariance), 0, settings, work) == 3
     # Differences of coordinates of 500 km round at 1e-10 m over the step of 1e-5 rad.
     expected = numerical_jacobian(gnss_position, state, settings)
-    np.testing.assert_allclose(work["jacobian"], expected, rtol=0.0, atol=1e-8 + 4e-11 * far)
+    np.testing.assert_allclose(work["jacobian"][:, :15], expected, rtol=0.0, atol=1e-8 + 4e-11 * far)
 
 
 @places
@@ -78,9 +78,9 @@ def test_jacobian_of_velocity(seed: int, far: float, settings: Any) -> None:
     """All columns: velocity, attitude through the lever arm and through the Earth rate, gyro bias."""
     state, covariance = example(seed, far)
     work = make_work()
-    assert gnss_velocity.linearize(state, payload_of((3.0, -4.0, 0.5), covariance), settings, work) == 3
+    assert gnss_velocity.linearize(state, payload_of((3.0, -4.0, 0.5), covariance), 0, settings, work) == 3
     expected = numerical_jacobian(gnss_velocity, state, settings)
-    np.testing.assert_allclose(work["jacobian"], expected, rtol=0.0, atol=3e-9)
+    np.testing.assert_allclose(work["jacobian"][:, :15], expected, rtol=0.0, atol=3e-9)
 
 
 def test_earth_rate_is_in_the_velocity_jacobian() -> None:
@@ -89,10 +89,10 @@ def test_earth_rate_is_in_the_velocity_jacobian() -> None:
     turn = to_rotation(state["attitude"])
     state["angular_rate"] = state["gyro_bias"] + turn.inv().apply(state["earth_rate_map"])
     work = make_work()
-    gnss_velocity.linearize(state, payload_of((0.0, 0.0, 0.0), covariance), LONG_ARM, work)
-    np.testing.assert_allclose(gnss_velocity.predict(state, LONG_ARM), state["velocity_map"], rtol=0.0, atol=1e-14)
+    gnss_velocity.linearize(state, payload_of((0.0, 0.0, 0.0), covariance), 0, LONG_ARM, work)
+    np.testing.assert_allclose(gnss_velocity.predict(state, 0, LONG_ARM), state["velocity_map"], rtol=0.0, atol=1e-14)
     part = work["jacobian"][:, 6:9]
-    assert np.abs(part).max() > 0.1 * EARTH_RATE * np.linalg.norm(LONG_ARM["lever_arm_body"])
+    assert np.abs(part).max() > 0.1 * EARTH_RATE * np.linalg.norm(LONG_ARM["lever_arms_body"][0])
     expected = numerical_jacobian(gnss_velocity, state, LONG_ARM)[:, 6:9]
     np.testing.assert_allclose(part, expected, rtol=0.0, atol=2e-9)
 
@@ -102,7 +102,7 @@ def test_earth_rate_is_in_the_velocity_jacobian() -> None:
 def test_innovation_of_position(seed: int, far: float) -> None:
     """A fix of the antenna, its coordinates by pymap3d, 3 m off: the innovation is the 3 m."""
     state, covariance = example(seed, far)
-    lever_arm = np.array(SETTINGS["lever_arm_body"])
+    lever_arm = np.array(SETTINGS["lever_arms_body"][0])
     antenna = state["position_map"] + to_rotation(state["attitude"]).apply(lever_arm)
     off = np.array([1.0, -2.0, 2.0])
     ecef = state["origin_ecef"] + state["map_to_ecef"] @ (antenna + off)
@@ -114,7 +114,7 @@ def test_innovation_of_position(seed: int, far: float) -> None:
         radius = 6.37e6
         geodetic += (north / radius, east / radius / math.cos(geodetic[0]), up)
     work = make_work()
-    gnss_position.linearize(state, payload_of(geodetic, covariance), SETTINGS, work)
+    gnss_position.linearize(state, payload_of(geodetic, covariance), 0, SETTINGS, work)
     np.testing.assert_allclose(work["innovation"], off, rtol=0.0, atol=2e-8)
 
 
@@ -125,12 +125,12 @@ def test_innovation_of_velocity(seed: int, far: float) -> None:
     state, covariance = example(seed, far)
     turn = to_rotation(state["attitude"])
     rate = state["angular_rate"] - state["gyro_bias"] - turn.inv().apply(state["earth_rate_map"])
-    antenna = state["velocity_map"] + turn.apply(np.cross(rate, SETTINGS["lever_arm_body"]))
+    antenna = state["velocity_map"] + turn.apply(np.cross(rate, SETTINGS["lever_arms_body"][0]))
     latitude, longitude, _ = geodetic_of(state)
     off = np.array([0.1, -0.2, 0.3])
     axes = local_axes_in_map(state, latitude, longitude)
     work = make_work()
-    gnss_velocity.linearize(state, payload_of(axes.T @ (antenna + off), covariance), SETTINGS, work)
+    gnss_velocity.linearize(state, payload_of(axes.T @ (antenna + off), covariance), 0, SETTINGS, work)
     np.testing.assert_allclose(work["innovation"], off, rtol=0.0, atol=1e-7)
 
 
@@ -141,7 +141,7 @@ def test_lever_arm_is_from_the_imu_in_its_axes() -> None:
     base_to_map = to_rotation(state["attitude"]).as_matrix() @ imu_to_base.T
     base = state["position_map"] - base_to_map @ np.array(MOUNT["imu__mount_position"])
     np.testing.assert_allclose(
-        gnss_position.predict(state, SETTINGS), base + base_to_map @ np.array(LEVER_ARM), rtol=0.0, atol=1e-12
+        gnss_position.predict(state, 0, SETTINGS), base + base_to_map @ np.array(LEVER_ARM), rtol=0.0, atol=1e-12
     )
 
 
@@ -152,11 +152,11 @@ def test_noise_is_turned_to_map_axes(seed: int, far: float) -> None:
     latitude, longitude, altitude = geodetic_of(state)
     axes = local_axes_in_map(state, latitude, longitude)
     work = make_work()
-    gnss_position.linearize(state, payload_of((latitude, longitude, altitude), covariance), SETTINGS, work)
+    gnss_position.linearize(state, payload_of((latitude, longitude, altitude), covariance), 0, SETTINGS, work)
     np.testing.assert_allclose(work["noise"], axes @ covariance @ axes.T, rtol=0.0, atol=1e-7)
 
-    gnss_velocity.linearize(state, payload_of((1.0, 2.0, 3.0), covariance), SETTINGS, work)
-    arm = np.array(SETTINGS["lever_arm_body"])
+    gnss_velocity.linearize(state, payload_of((1.0, 2.0, 3.0), covariance), 0, SETTINGS, work)
+    arm = np.array(SETTINGS["lever_arms_body"][0])
     cross = np.array([[0.0, -arm[2], arm[1]], [arm[2], 0.0, -arm[0]], [-arm[1], arm[0], 0.0]])
     sway = to_rotation(state["attitude"]).as_matrix() @ cross
     rate_variance = SETTINGS["gyro_noise_density"] ** 2 / state["imu_interval"]
@@ -169,15 +169,15 @@ def test_unknown_heading_leaves_the_lever_arm_to_the_noise(seed: int) -> None:
     state, covariance = example(seed, 0.0)
     payload = payload_of(geodetic_of(state), covariance)
     work, known = make_work(), make_work()
-    arm = to_rotation(state["attitude"]).apply(SETTINGS["lever_arm_body"])
-    gnss_position.linearize(state, payload, SETTINGS, known)
+    arm = to_rotation(state["attitude"]).apply(SETTINGS["lever_arms_body"][0])
+    gnss_position.linearize(state, payload, 0, SETTINGS, known)
     state["heading_known"] = 0
-    gnss_position.linearize(state, payload, SETTINGS, work)
-    assert (work["jacobian"] == np.eye(3, 15)).all()
+    gnss_position.linearize(state, payload, 0, SETTINGS, work)
+    assert (work["jacobian"][:, :15] == np.eye(3, 15)).all()
     extra = work["noise"] - known["noise"]
     np.testing.assert_allclose(extra, np.diag([1.0, 1.0, 0.0]) * (arm[0] ** 2 + arm[1] ** 2), rtol=0.0, atol=1e-12)
-    gnss_velocity.linearize(state, payload, SETTINGS, work)
-    assert (work["jacobian"] == np.eye(3, 15, 3)).all()
+    gnss_velocity.linearize(state, payload, 0, SETTINGS, work)
+    assert (work["jacobian"][:, :15] == np.eye(3, 15, 3)).all()
 
 
 @seeds
@@ -189,9 +189,9 @@ def test_linearizing_changes_nothing_but_the_work(seed: int, aid: ModuleType) ->
     work = make_work()
     work["jacobian"] = 7.0
     work["noise"] = 7.0
-    aid.linearize(state, payload, SETTINGS, work)
+    aid.linearize(state, payload, 0, SETTINGS, work)
     once = work.copy()
-    aid.linearize(state, payload, SETTINGS, work)
+    aid.linearize(state, payload, 0, SETTINGS, work)
     assert state.tobytes() == before.tobytes()
     for name in ("jacobian", "noise", "innovation"):
         np.testing.assert_array_equal(work[name], once[name])

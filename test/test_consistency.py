@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from kernels import core
 
 from eskf_ros.filter import layout, navigator, strapdown, update
 from eskf_ros.filter.layout import ACCEL_BIAS, GYRO_BIAS
@@ -204,12 +205,12 @@ class FrozenGain:
             correction = self.gains[stream] @ self.work["innovation"]
             for block in (ACCEL_BIAS, GYRO_BIAS):
                 correction[block : block + 3] = body_to_map.T @ correction[block : block + 3]
-            self.work["correction"] = correction
+            self.work["correction"][:15] = correction
             update.inject(self.state, self.work["correction"])
 
     def optimal_gain(self, body_to_map: np.ndarray) -> np.ndarray:
         """The Kalman gain of what was just linearised, (15, 3), the rows of the biases in map axes."""
-        covariance, jacobian = self.state["covariance"], self.work["jacobian"]
+        covariance, jacobian = core(self.state), self.work["jacobian"][:, :15]
         spread = jacobian @ covariance @ jacobian.T + self.work["noise"]
         gain = np.linalg.solve(spread, jacobian @ covariance).T
         # As the estimator does, so that the velocity of the same epoch finds the position already used.

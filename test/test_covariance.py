@@ -10,6 +10,7 @@ from kernels import (
     USUAL_STDS,
     conditioned_eigenvalues,
     copy_of,
+    core,
     error_of,
     make_settings,
     make_state,
@@ -84,9 +85,9 @@ def transition_of_step(state: Any, samples: tuple[Any, Any, Any, Any], dt: float
     transition = np.empty((15, 15))
     for j in range(15):
         before = copy_of(state)
-        before["covariance"] = 0.0
-        before["covariance"][j, j] = 1.0
-        after = stepped(before, samples, dt)["covariance"]
+        core(before)[:] = 0.0
+        core(before)[j, j] = 1.0
+        after = core(stepped(before, samples, dt))
         transition[:, j] = after[:, j] / np.sqrt(after[j, j])
     return transition
 
@@ -211,9 +212,9 @@ def test_propagation_is_the_dense_product(seed: int, dt: float, gap: float) -> N
     state, samples = random_state(seed), readings(seed, dt)
     before = random_covariance(seed, USUAL_STDS)
     transition = transition_of_step(state, samples, dt)
-    state["covariance"] = before
+    core(state)[:] = before
     step(state, *samples, dt, gap, SETTINGS, WORK)
-    after = state["covariance"]
+    after = core(state)
     expected = transition @ before @ transition.T + dense_noise(dt, gap)
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     np.testing.assert_allclose(after / scale, expected / scale, rtol=0.0, atol=1e-13)
@@ -229,7 +230,7 @@ def test_a_gap_adds_the_variance_of_a_constant_hidden_motion() -> None:
         for _ in range(round(gap / dt)):
             still = ((0.0, 0.0, 9.81), (0.0, 0.0, 0.0))
             step(state, *still, *still, dt, hole, SETTINGS, WORK)
-        variances.append(np.diag(state["covariance"]).copy())
+        variances.append(np.diag(core(state)).copy())
     extra = variances[1] - variances[0]
     # Without what the tilt, itself more uncertain, adds to the horizontal velocity: the vertical one.
     assert np.sqrt(extra[5]) == pytest.approx(SETTINGS["gap_accel_std"] * gap, rel=1e-3)
@@ -245,9 +246,9 @@ def test_covariance_stays_symmetric_and_positive_definite_for_an_hour() -> None:
     rate = np.stack([0.02 * np.cos(seconds), 0.02 * np.sin(seconds), 0.1 * np.sin(0.05 * seconds)], axis=-1)
     state = make_state()
     stds = np.repeat([1e-3, 1e-3, 1e-5, 0.1, 1e-2], 3)
-    state["covariance"] = np.diag((stds * rng.uniform(0.5, 2.0, 15)) ** 2)
+    core(state)[:] = np.diag((stds * rng.uniform(0.5, 2.0, 15)) ** 2)
     run_samples(state, stamps, force, rate, SETTINGS, WORK)
-    after = state["covariance"]
+    after = core(state)
     assert (after == after.T).all()
     assert np.isfinite(after).all()
     assert conditioned_eigenvalues(after).min() > 1e-13, conditioned_eigenvalues(after)

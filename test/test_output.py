@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from kernels import (
     USUAL_STDS,
+    core,
     make_settings,
     random_covariance,
     random_state,
@@ -40,7 +41,7 @@ def published(state: Any, settings: Any) -> Any:
 
 def running(seed: int) -> Any:
     state = random_state(seed, far=100.0)
-    state["covariance"] = random_covariance(seed, USUAL_STDS)
+    core(state)[:] = random_covariance(seed, USUAL_STDS)
     state["absolute_stamp"] = 0
     return state
 
@@ -97,7 +98,7 @@ def test_pose_covariance_against_numerical_differentiation(seed: int) -> None:
             turn = (true_attitude * attitude.inv()).as_rotvec()
             ends.append(np.concatenate([true_position - position, turn]))
         jacobian[:, j] = (ends[0] - ends[1]) / (2.0 * PERTURBATION[j])
-    expected = jacobian @ state["covariance"] @ jacobian.T
+    expected = jacobian @ core(state) @ jacobian.T
     covariance = published(state, MOUNTED)["pose_covariance"]
     np.testing.assert_allclose(covariance, expected, rtol=0.0, atol=1e-8)
     assert (covariance == covariance.T).all()
@@ -117,7 +118,7 @@ def expected_twist_covariance(state: Any, mount_position: Any, settings: Any) ->
     jacobian = twist_jacobian(state, mount_position)
     jacobian[:3, 12:15] = 0.0
     jacobian[3:, 6:9] = 0.0
-    expected = jacobian @ state["covariance"] @ jacobian.T
+    expected = jacobian @ core(state) @ jacobian.T
     expected[:3, 3:] = expected[3:, :3] = 0.0
     expected[3:, 3:] += settings["gyro_noise_density"] ** 2 / state["imu_interval"] * np.eye(3)
     return np.asarray(expected)
@@ -131,9 +132,7 @@ def test_twist_covariance_of_a_turned_imu(seed: int) -> None:
     # 1e-6 of a velocity variance: the Earth rate.
     np.testing.assert_allclose(covariance, expected, rtol=0.0, atol=1e-6)
     assert (covariance == covariance.T).all()
-    np.testing.assert_array_equal(
-        published(state, TURNED_ONLY)["velocity_covariance_map"], state["covariance"][3:6, 3:6]
-    )
+    np.testing.assert_array_equal(published(state, TURNED_ONLY)["velocity_covariance_map"], core(state)[3:6, 3:6])
 
 
 @seeds
@@ -151,14 +150,14 @@ def test_biases_are_in_imu_axes(seed: int) -> None:
     row = published(state, MOUNTED)
     np.testing.assert_array_equal(row["accel_bias"], state["accel_bias"])
     np.testing.assert_array_equal(row["gyro_bias"], state["gyro_bias"])
-    stds = np.sqrt(np.diag(state["covariance"]))
+    stds = np.sqrt(np.diag(core(state)))
     np.testing.assert_array_equal(row["accel_bias_std"], stds[9:12])
     np.testing.assert_array_equal(row["gyro_bias_std"], stds[12:15])
 
 
 def test_status_is_a_ladder() -> None:
     state = running(1)
-    state["covariance"][8, 8] = 1e-6
+    core(state)[8, 8] = 1e-6
     settings = make_settings()
     assert status_of(state, settings) == Status.GOOD
     state["stamp"] = 999_999_999
@@ -175,7 +174,7 @@ def test_status_is_a_ladder() -> None:
     state["stamp"] = 3_000_000_001
     assert status_of(state, settings) == Status.COASTING
     state["stamp"] = 0
-    state["covariance"][8, 8] = (1.01 * settings["good_heading_std"]) ** 2
+    core(state)[8, 8] = (1.01 * settings["good_heading_std"]) ** 2
     assert status_of(state, settings) == Status.ALIGNING
     for field, status in (
         ("heading_known", Status.WAITING_HEADING),

@@ -1,4 +1,4 @@
-"""Start-up: level from gravity, position from the first fix, heading from a parameter or from course over ground.
+"""Start-up: level from gravity, position from the first fix, heading from a parameter or from acceleration and course.
 
 While the heading is unknown its error has the variance of a half turn and is not estimated: GNSS moves position and
 velocity only (``strapdown.step`` cuts the coupling), the gyros carry the attitude. Every still window until the
@@ -11,9 +11,30 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import EARTH_RATE, STANDARD_GRAVITY, east_north_up_to_ecef, geodetic_to_ecef
+from eskf_ros.filter.aiding.common import set_east_north_up_covariance
 from eskf_ros.filter.aiding.gnss_position import position_of_fix
+from eskf_ros.filter.aiding.gnss_velocity import body_rate, local_east_north_up_to_ecef
 from eskf_ros.filter.covariance import transform_error
-from eskf_ros.filter.layout import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, NEVER, POSITION, VELOCITY
+from eskf_ros.filter.heading_search import (
+    COSINE,
+    begin_search,
+    forget_search,
+    note_level,
+    spread,
+    turn_found,
+    update_search,
+)
+from eskf_ros.filter.layout import (
+    ACCEL_BIAS,
+    ATTITUDE,
+    ERROR_CAPACITY,
+    ERROR_SIZE,
+    GYRO_BIAS,
+    NEVER,
+    POSITION,
+    VELOCITY,
+    Stream,
+)
 from eskf_ros.filter.monitors import watch_input
 from eskf_ros.filter.strapdown import gravity_map
 from eskf_ros.filter.warm_start import do_biases_hold
@@ -30,6 +51,9 @@ from eskf_ros.rotation import (
     to_rotation_vector,
     wrapped,
 )
+
+GNSS_POSITION = int(Stream.GNSS_POSITION)
+GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
 
 START_POSITION_STD = 1000.0
 START_VELOCITY_STD = 100.0
@@ -53,6 +77,11 @@ UNKNOWN_SPEED = 10.0
 COURSE_MAX_STD = 0.17
 COURSE_MAX_TURN_RATE = 0.2
 """Course over ground gives heading only when it is this certain (rad) and the robot turns no faster (rad/s)."""
+
+CERTAIN = 3.0
+LEAST_LENGTH = 0.5
+COURSE_SEARCH_STD = 0.35
+"""The course is believed when the search agrees within three sigma, and knows the direction so well by itself (rad)."""
 
 MINIMUM_WINDOW_SAMPLES = 10
 
@@ -94,7 +123,7 @@ def turn_attitude(state, rotation_vector):
 
 
 @njit
-def move_datum(state, latitude, longitude, altitude):
+def move_datum(state, latitude, longitude, altitude, settings):
     """Describe the same state in the local frame of another datum (rad, rad, m): an exact rotation and shift."""
     old = east_north_up_to_ecef(state.datum[0], state.datum[1])
     offset = rotate(old, state.position_map)
@@ -113,7 +142,13 @@ def move_datum(state, latitude, longitude, altitude):
         state.velocity_map[i] = velocity[i]
     transform_error(state.covariance, POSITION, turn)
     transform_error(state.covariance, VELOCITY, turn)
+    place = settings.position_error_at
+    if place < state.error_size:
+        transform_error(state.covariance, place, turn)
+        lasting = state.optional[place - ERROR_SIZE : place - ERROR_SIZE + 3]
+        lasting[0], lasting[1], lasting[2] = rotate(turn, (lasting[0], lasting[1], lasting[2]))
     turn_attitude(state, to_rotation_vector(from_matrix(turn)))
+    forget_search(state)
 
 
 @njit
@@ -140,6 +175,7 @@ def shortest_turn(a, b):
 def restart(state):
     """Start the alignment again; only the datum stays."""
     state.restarts += 1
+    forget_search(state)
     state.rejected_fixes = 0
     state.level_known = 0
     state.position_known = 0
@@ -247,11 +283,12 @@ def distrust_level(state, settings):
     """Give tilt and gyro bias the uncertainty of a level taken while moving."""
     state.still_stamp = NEVER
     state.still_count = 0
+    note_level(state, settings.moving_tilt_std**2)
     up = local_up(state)
     covariance = state.covariance
     for i in range(3):
         state.gyro_bias[i] = 0.0
-        for j in range(ERROR_SIZE):
+        for j in range(ERROR_CAPACITY):
             covariance[GYRO_BIAS + i, j] = 0.0
             covariance[j, GYRO_BIAS + i] = 0.0
         for j in range(3):
@@ -324,7 +361,7 @@ def level(state, sums, count, interval, still, settings):
 
     covariance = state.covariance
     for i in range(ATTITUDE, ERROR_SIZE):
-        for j in range(ERROR_SIZE):
+        for j in range(ERROR_CAPACITY):
             covariance[i, j] = 0.0
             covariance[j, i] = 0.0
     if still:
@@ -333,6 +370,7 @@ def level(state, sums, count, interval, still, settings):
     else:
         turn_rate_square = (sums[3] ** 2 + sums[4] ** 2 + sums[5] ** 2) / count**2
         tilt_noise = settings.moving_tilt_std**2 + turn_rate_square * (UNKNOWN_SPEED / strength) ** 2
+    note_level(state, tilt_noise)
     heading_variance = math.pi**2
     if state.heading_known == 1:
         heading_variance = settings.initial_heading_std**2
@@ -419,7 +457,7 @@ def heading_of(state, settings):
 def set_heading(state, heading, std, settings):
     """Turn the attitude about the local vertical to ``heading`` (rad), independent of everything else by ``std``."""
     up = local_up(state)
-    lever = rotate(to_matrix(state.attitude), settings.lever_arm_body)
+    lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[0])
     change = heading - heading_of(state, settings)
     turn_attitude(state, (change * up[0], change * up[1], change * up[2]))
     covariance = state.covariance
@@ -434,7 +472,7 @@ def set_heading(state, heading, std, settings):
             covariance[ATTITUDE + i, ATTITUDE + j] += up[i] * up[j] * std**2
     if state.position_known == 1:
         # GNSS held the antenna in place: the body is on the other end of the lever arm.
-        turned = rotate(to_matrix(state.attitude), settings.lever_arm_body)
+        turned = rotate(to_matrix(state.attitude), settings.lever_arms_body[0])
         for i in range(3):
             state.position_map[i] += lever[i] - turned[i]
 
@@ -450,7 +488,7 @@ def start_position(state, payload):
     for i in range(3):
         state.position_map[i] = position[i]
         state.velocity_map[i] = 0.0
-        for j in range(ERROR_SIZE):
+        for j in range(ERROR_CAPACITY):
             covariance[POSITION + i, j] = 0.0
             covariance[j, POSITION + i] = 0.0
             covariance[VELOCITY + i, j] = 0.0
@@ -467,16 +505,17 @@ def place(state, position, position_covariance, heading, heading_std, settings):
     """Put base_link to a position (m, map) with a covariance (3, 3) and a heading (rad), whatever was known before."""
     covariance = state.covariance
     for i in range(3):
-        for j in range(ERROR_SIZE):
+        for j in range(ERROR_CAPACITY):
             covariance[POSITION + i, j] = 0.0
             covariance[j, POSITION + i] = 0.0
     if state.position_known == 0:
         for i in range(3):
-            for j in range(ERROR_SIZE):
+            for j in range(ERROR_CAPACITY):
                 covariance[VELOCITY + i, j] = 0.0
                 covariance[j, VELOCITY + i] = 0.0
             covariance[VELOCITY + i, VELOCITY + i] = START_VELOCITY_STD**2
     state.position_known = 0
+    forget_search(state)
     set_heading(state, heading, heading_std, settings)
     m = settings.imu_position_base
     offset = rotate(to_matrix(state.attitude), rotate_back(settings.imu_to_base, (m[0], m[1], m[2])))
@@ -489,11 +528,47 @@ def place(state, position, position_covariance, heading, heading_std, settings):
 
 
 @njit
+def search_heading(state, aid, gate, settings, work):
+    """Let a GNSS measurement that was fused take part in the search for the heading, and look whether it is over."""
+    rotation = to_matrix(state.attitude)
+    arm = settings.lever_arms_body[aid.source]
+    if aid.stream == GNSS_POSITION:
+        first = 0
+        measured = position_of_fix(state, aid.payload)
+        lever = rotate(rotation, arm)
+        local_to_ecef = east_north_up_to_ecef(aid.payload[0], aid.payload[1])
+    elif aid.stream == GNSS_VELOCITY:
+        first = 2
+        local_to_ecef = local_east_north_up_to_ecef(state)
+        velocity = rotate(local_to_ecef, (aid.payload[0], aid.payload[1], aid.payload[2]))
+        measured = rotate_back(state.map_to_ecef, velocity)
+        lever = rotate(rotation, cross(body_rate(state, rotation), arm))
+    else:
+        return
+    set_east_north_up_covariance(work.noise, state, local_to_ecef, aid.payload, 3)
+    if state.search_started == 1:
+        update_search(state, first, measured, lever, work.noise, gate, work)
+    elif first == 0:
+        reach = lever[0] ** 2 + lever[1] ** 2
+        begin_search(state, measured[0], measured[1], max(work.noise[0, 0], work.noise[1, 1]) + reach)
+    turn, std = turn_found(state)
+    if std <= settings.found_heading_std:
+        set_heading(state, heading_of(state, settings) + turn, std, settings)
+        state.heading_known = 1
+    elif settings.use_course == 1:
+        align_to_course(state, settings)
+
+
+@njit
 def align_to_course(state, settings):
-    """Take the unknown heading from the course, if that is certain and steady; the robot is driving forward."""
+    """Take the unknown heading from the course, if that is certain and steady and the search knows which end is ahead.
+
+    Accelerations tell forward from reverse, and side slip from driving straight, long before they tell the heading as
+    well as the course does.
+    """
     v = state.velocity_map
     speed = math.sqrt(v[0] ** 2 + v[1] ** 2)
-    if speed == 0.0:
+    if speed < settings.course_min_speed or state.search_started == 0:
         return
     along = (v[0] / speed, v[1] / speed)
     covariance = state.covariance
@@ -502,22 +577,30 @@ def align_to_course(state, settings):
     pyy = covariance[VELOCITY + 1, VELOCITY + 1]
     along_variance = along[0] ** 2 * pxx + 2.0 * along[0] * along[1] * pxy + along[1] ** 2 * pyy
     across_variance = along[1] ** 2 * pxx - 2.0 * along[0] * along[1] * pxy + along[0] ** 2 * pyy
-    course_variance = across_variance / speed**2
+    course_std = math.sqrt(max(across_variance, 0.0) / speed**2 + settings.course_std**2)
     up = local_up(state)
-    rate = (
-        state.angular_rate[0] - state.gyro_bias[0],
-        state.angular_rate[1] - state.gyro_bias[1],
-        state.angular_rate[2] - state.gyro_bias[2],
-    )
-    turn_rate = dot(up, rotate(to_matrix(state.attitude), rate))
+    turn_rate = dot(up, rotate(to_matrix(state.attitude), body_rate(state, to_matrix(state.attitude))))
     if (
-        speed < settings.course_min_speed
-        or course_variance > COURSE_MAX_STD**2
+        across_variance > (COURSE_MAX_STD * speed) ** 2
         or speed**2 < 9.0 * along_variance
         or abs(turn_rate) > COURSE_MAX_TURN_RATE
     ):
         return
-    set_heading(state, math.atan2(v[1], v[0]), math.sqrt(course_variance + settings.course_std**2), settings)
+    heading = math.atan2(v[1], v[0])
+    turn = heading - heading_of(state, settings)
+    cosine, sine = math.cos(turn), math.sin(turn)
+    ahead = cosine * state.search[COSINE] + sine * state.search[COSINE + 1]
+    aside = cosine * state.search[COSINE + 1] - sine * state.search[COSINE]
+    ahead_std, aside_std = spread(state, cosine, sine)
+    if (
+        abs(ahead) < max(CERTAIN * ahead_std, LEAST_LENGTH)
+        or aside_std > COURSE_SEARCH_STD * abs(ahead)
+        or abs(aside) > CERTAIN * math.hypot(aside_std, course_std * abs(ahead))
+    ):
+        return
+    if ahead < 0.0:
+        heading += math.pi
+    set_heading(state, heading, course_std, settings)
     state.heading_known = 1
 
 
@@ -530,7 +613,7 @@ def recall_heading(state, payload, settings):
     if settings.has_memory == 0 or state.restarts > 0 or state.heading_known == 1:
         return
     fix = geodetic_to_ecef(payload[0], payload[1], payload[2])
-    place, lever, mount = settings.remembered_place_ecef, settings.lever_arm_body, settings.imu_position_base
+    place, lever, mount = settings.remembered_place_ecef, settings.lever_arms_body[0], settings.imu_position_base
     way = (fix[0] - place[0], fix[1] - place[1], fix[2] - place[2])
     fix_std = math.sqrt(max(payload[3], payload[6], payload[8]))
     # The antenna is at most this far from base_link, on whatever side.

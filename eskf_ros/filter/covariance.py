@@ -11,7 +11,7 @@ Error dynamics of the local Earth-fixed frame with the attitude error theta on t
 One interval is integrated to second order: the attitude error of mid-interval enters the velocity, the mean of old
 and new velocity error the position. That is a transition of nine rows which never becomes a matrix: it is applied to
 the columns of P, and again to the columns of the transpose of the result. The bias rows do not change, so the second
-round has nine columns only.
+round has nine columns only. Optional errors, of which the core knows nothing, are carried by their columns alone.
 """
 
 from __future__ import annotations
@@ -101,10 +101,10 @@ def add_noise(covariance, velocity_noise, attitude_noise, dt, settings):
 
 
 @njit
-def propagate_covariance(covariance, rotation, force, gravity, earth_rate, dt, coupling, work):
+def propagate_covariance(covariance, size, rotation, force, gravity, earth_rate, dt, coupling, work):
     """Apply one interval's transition on both sides of the covariance; arguments as for ``apply_transition``.
 
-    ``gravity`` is the vector (m/s2, map); the result is exactly symmetric.
+    ``size`` errors are in use; ``gravity`` is the vector (m/s2, map); the result is exactly symmetric.
     """
     strength = math.sqrt(gravity[0] * gravity[0] + gravity[1] * gravity[1] + gravity[2] * gravity[2])
     up = (-gravity[0] / strength, -gravity[1] / strength, -gravity[2] / strength)
@@ -121,16 +121,23 @@ def propagate_covariance(covariance, rotation, force, gravity, earth_rate, dt, c
         for j in range(ACCEL_BIAS, ERROR_SIZE):
             covariance[i, j] = half[i, j]
             covariance[j, i] = half[i, j]
+    if size > ERROR_SIZE:
+        columns = covariance[:, ERROR_SIZE:size]
+        count = size - ERROR_SIZE
+        apply_transition(columns, columns, count, rotation, force, up, gradient, earth_rate, dt, coupling)
+        for i in range(ACCEL_BIAS):
+            for j in range(ERROR_SIZE, size):
+                covariance[j, i] = covariance[i, j]
 
 
 @njit
 def transform_error(covariance, block, matrix):
     """Replace the three errors from index ``block`` by ``matrix`` (3x3 row tuples) times themselves."""
-    for j in range(ERROR_SIZE):
+    for j in range(len(covariance)):
         error = rotate(matrix, (covariance[block, j], covariance[block + 1, j], covariance[block + 2, j]))
         for i in range(3):
             covariance[block + i, j] = error[i]
-    for j in range(ERROR_SIZE):
+    for j in range(len(covariance)):
         error = rotate(matrix, (covariance[j, block], covariance[j, block + 1], covariance[j, block + 2]))
         for i in range(3):
             covariance[j, block + i] = error[i]

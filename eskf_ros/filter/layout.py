@@ -15,13 +15,28 @@ import numpy as np
 
 from eskf_ros.compiled import COMPILED
 
-# Error state: first index of each block of three.
+# Error state: first index of each block of three. These 15 are the core; every robot has them.
 POSITION = 0
 VELOCITY = 3
 ATTITUDE = 6
 ACCEL_BIAS = 9
 GYRO_BIAS = 12
 ERROR_SIZE = 15
+
+OPTIONAL_SIZES = {"position_error": 3}
+"""Optional errors behind the core, and how many each is: see ``optional``."""
+
+OPTIONAL_CAPACITY = sum(OPTIONAL_SIZES.values())
+ERROR_CAPACITY = ERROR_SIZE + OPTIONAL_CAPACITY
+
+NOWHERE = ERROR_CAPACITY
+"""The place of an optional error that is switched off: behind every error there can be."""
+
+SOURCES = 2
+"""GNSS receivers with antennas of their own, by their index."""
+
+SEARCH_SIZE = 8
+"""States of the search for the heading (see ``heading_search``)."""
 
 NEVER = -(2**62)
 """Stamp before everything."""
@@ -85,8 +100,11 @@ STATE = np.dtype(
         ("attitude", "f8", (4,)),
         ("accel_bias", "f8", (3,)),
         ("gyro_bias", "f8", (3,)),
-        # Covariance of the error state; the attitude error is a small rotation on the map side.
-        ("covariance", "f8", (ERROR_SIZE, ERROR_SIZE)),
+        # Optional states in the order of their places; how many errors are in use, the core's included.
+        ("optional", "f8", (OPTIONAL_CAPACITY,)),
+        ("error_size", "i8"),
+        # Covariance of the first ``error_size`` errors; the attitude error is a small rotation on the map side.
+        ("covariance", "f8", (ERROR_CAPACITY, ERROR_CAPACITY)),
         # Raw IMU reading at ``stamp``; the last IMU sample, its stamp and the interval (s) it ended; the one before.
         ("specific_force", "f8", (3,)),
         ("angular_rate", "f8", (3,)),
@@ -114,10 +132,19 @@ STATE = np.dtype(
         ("position_known", "i8"),
         ("heading_known", "i8"),
         ("first_stamp", "i8"),
+        # Search for the heading: position, velocity, cosine and sine, acceleration error; tilt variance (rad2) apart
+        # from the accelerometer bias, seconds and radians turned since the last level.
+        ("search_started", "i8"),
+        ("search", "f8", (SEARCH_SIZE,)),
+        ("search_covariance", "f8", (SEARCH_SIZE, SEARCH_SIZE)),
+        ("search_tilt_variance", "f8"),
+        ("search_age", "f8"),
+        ("search_turn", "f8"),
         # External evidence of motion: when GNSS last proved it, the last fix, and the one the window started from.
         ("motion_stamp", "i8"),
         ("last_fix_stamp", "i8"),
         ("last_fix_ecef", "f8", (3,)),
+        ("last_fix_variance", "f8", (SOURCES,)),
         ("anchor_stamp", "i8"),
         ("anchor_ecef", "f8", (3,)),
         # Stillness: sums over the window being filled, and over the unbroken run of still windows before it.
@@ -154,6 +181,7 @@ AID = np.dtype(
         ("stamp", "i8"),
         ("arrival", "i8"),
         ("stream", "i4"),
+        ("source", "i4"),
         ("door", "i4"),
         ("verdict", "i4"),
         ("dof", "i4"),
@@ -164,13 +192,17 @@ AID = np.dtype(
     ],
     align=True,
 )
-"""One offered measurement: what was sent, what became of it, and whether ``take_live`` has told that already."""
+"""One offered measurement: what was sent, what became of it, and whether ``take_live`` has told that already.
+
+``source``: which of several receivers it is from.
+"""
 
 RECORD = np.dtype(
     [
         ("stamp", "i8"),
         ("arrival", "i8"),
         ("stream", "i4"),
+        ("source", "i4"),
         ("verdict", "i4"),
         ("dof", "i4"),
         ("nis", "f8"),
@@ -221,8 +253,10 @@ SETTINGS = np.dtype(
         ("gap_gyro_std", "f8"),
         ("imu_to_base", "f8", (3, 3)),
         ("imu_position_base", "f8", (3,)),
-        ("lever_arm_body", "f8", (3,)),
-        ("gate", "f8", (4,)),
+        ("lever_arms_body", "f8", (SOURCES, 3)),
+        ("correlated_share", "f8"),
+        ("gate", "f8", (len(Stream), 4)),
+        ("reach", "i8", (len(Stream),)),
         ("static_duration", "f8"),
         ("moving_start_after", "f8"),
         ("still_gyro_std", "f8"),
@@ -230,6 +264,8 @@ SETTINGS = np.dtype(
         ("moving_tilt_std", "f8"),
         ("initial_heading", "f8"),
         ("initial_heading_std", "f8"),
+        ("use_course", "i8"),
+        ("found_heading_std", "f8"),
         ("course_min_speed", "f8"),
         ("course_std", "f8"),
         ("good_heading_std", "f8"),
@@ -245,10 +281,19 @@ SETTINGS = np.dtype(
         ("remembered_forward_ecef", "f8", (3,)),
         ("remembered_heading_std", "f8"),
         ("output_interval", "i8"),
+        *((f"{name}_at", "i8") for name in OPTIONAL_SIZES),
+        ("optional_std", "f8", (OPTIONAL_CAPACITY,)),
+        ("optional_noise_density", "f8", (OPTIONAL_CAPACITY,)),
+        ("optional_decay", "f8", (OPTIONAL_CAPACITY,)),
     ],
     align=True,
 )
-"""Parameters as the kernels use them: radians, body axes, gate thresholds by degrees of freedom."""
+"""Parameters as the kernels use them: radians, body axes, gate thresholds by stream and degrees of freedom.
+
+``reach``: how many errors have to be in use for a measurement of a stream. ``NAME_at``: place of an optional error, or
+`NOWHERE`. ``optional_*``, from the first place behind the core: standard deviation at first, white noise that drives it
+(unit/rtHz), inverse correlation time (1/s).
+"""
 
 LOCAL = np.dtype(
     [
@@ -266,14 +311,14 @@ WORK = np.dtype(
     [
         ("half", "f8", (ACCEL_BIAS, ERROR_SIZE)),
         ("turned", "f8", (ERROR_SIZE, ACCEL_BIAS)),
-        ("jacobian", "f8", (3, ERROR_SIZE)),
+        ("jacobian", "f8", (3, ERROR_CAPACITY)),
         ("innovation", "f8", (3,)),
         ("noise", "f8", (3, 3)),
-        ("projected", "f8", (3, ERROR_SIZE)),
+        ("projected", "f8", (3, ERROR_CAPACITY)),
         ("innovation_covariance", "f8", (3, 3)),
-        ("gain", "f8", (ERROR_SIZE, 3)),
-        ("residual_gain", "f8", (ERROR_SIZE, 3)),
-        ("correction", "f8", (ERROR_SIZE,)),
+        ("gain", "f8", (ERROR_CAPACITY, 3)),
+        ("residual_gain", "f8", (ERROR_CAPACITY, 3)),
+        ("correction", "f8", (ERROR_CAPACITY,)),
     ],
     align=True,
 )
@@ -326,6 +371,7 @@ def blank_state() -> np.ndarray:
     for field in ("stamp", "imu_stamp", "first_stamp", "window_start", "absolute_stamp", *_EVIDENCE):
         state[field] = NEVER
     state["attitude"][0, 0] = 1.0
+    state["error_size"] = ERROR_SIZE
     # Until there are two samples: longer than any gap, so that the first interval takes no bend from an earlier one.
     state["imu_interval"] = 1e9
     return state

@@ -14,7 +14,6 @@ from eskf_ros.compiled import njit
 from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
 from eskf_ros.filter.aiding import gnss_position, gnss_velocity
 from eskf_ros.filter.alignment import (
-    align_to_course,
     heading_of,
     move_datum,
     note_position,
@@ -22,6 +21,7 @@ from eskf_ros.filter.alignment import (
     place,
     recall_heading,
     restart,
+    search_heading,
     set_datum,
     start_position,
     watch_stillness,
@@ -29,10 +29,13 @@ from eskf_ros.filter.alignment import (
 from eskf_ros.filter.door import admit
 from eskf_ros.filter.layout import (
     AID,
+    ERROR_SIZE,
     IMU,
     LOCAL,
     NEVER,
+    NOWHERE,
     ODOMETRY,
+    OPTIONAL_SIZES,
     RECORD,
     SETTINGS,
     STATE,
@@ -46,8 +49,9 @@ from eskf_ros.filter.layout import (
 )
 from eskf_ros.filter.local import carry, measure_step, note_jump
 from eskf_ros.filter.monitors import complaints
+from eskf_ros.filter.optional import join
 from eskf_ros.filter.output import status_of, write_odometry
-from eskf_ros.filter.recovery import is_near_gate, judge_filter, update_weighed_down
+from eskf_ros.filter.recovery import is_near_gate, judge_filter, update_weighed_down, watch_solution
 from eskf_ros.filter.strapdown import SECOND, propagate
 from eskf_ros.filter.timeline import (
     CHECKPOINT_SPACING,
@@ -183,16 +187,20 @@ def fuse(state, aids, i, settings, work):
     if state.position_known == 0:
         start_position(state, aid.payload)
         recall_heading(state, aid.payload, settings)
+    join(state, settings.reach[aid.stream], settings)
+    if aid.stream == GNSS_POSITION:
+        watch_solution(state, aid, settings)
     size = linearize(state, aid, settings, work)
+    gate = settings.gate[aid.stream, size]
     for k in range(size):
         aid.innovation[k] = work.innovation[k]
     aid.dof = size
-    aid.verdict, aid.nis = update(state, size, settings.gate[size], work)
-    if aid.stream == GNSS_POSITION and is_near_gate(aid.verdict, aid.nis, settings.gate[size]):
+    aid.verdict, aid.nis = update(state, size, gate, work)
+    if aid.stream == GNSS_POSITION and is_near_gate(aid.verdict, aid.nis, gate):
         linearize(state, aid, settings, work)
-        aid.verdict = update_weighed_down(state, size, aid.nis / settings.gate[size], work)
+        aid.verdict = update_weighed_down(state, size, aid.nis / gate, work)
     if aid.verdict == FUSED and state.heading_known == 0:
-        align_to_course(state, settings)
+        search_heading(state, aid, gate, settings, work)
     if aid.stream == GNSS_POSITION:
         judge_filter(state, aid.verdict)
     note_jump(state, position, heading, settings)
@@ -202,8 +210,8 @@ def fuse(state, aids, i, settings, work):
 def linearize(state, aid, settings, work):
     """Write innovation, Jacobian and noise of one measurement to ``work``; return its size. The list of aids."""
     if aid.stream == GNSS_POSITION:
-        return gnss_position.linearize(state, aid.payload, settings, work)
-    return gnss_velocity.linearize(state, aid.payload, settings, work)
+        return gnss_position.linearize(state, aid.payload, aid.source, settings, work)
+    return gnss_velocity.linearize(state, aid.payload, aid.source, settings, work)
 
 
 @njit
@@ -238,7 +246,6 @@ class Navigator:
         self._settings = settings_from(parameters, self._output_rate)
         if self._memory is not None:
             recall(*self._memory, parameters, self._settings[0])
-        self._gnss_offset = round(parameters.gnss.time_offset * SECOND)
 
     def reset(self) -> None:
         """Forget everything, the datum too unless it is a parameter; records that were not taken are lost."""
@@ -286,7 +293,7 @@ class Navigator:
         self._refused.insert(0, self._take_records(True))
         datum = math.radians(latitude_deg), math.radians(longitude_deg), float(altitude)
         if state["position_known"]:
-            move_datum(state, *datum)
+            move_datum(state, *datum, settings)
             note_jump(state, position, heading, settings)
         else:
             set_datum(state, *datum)
@@ -361,11 +368,12 @@ class Navigator:
         covariance_type: int,
         status: int,
         arrival: int = 0,
+        frame_id: str = "",
     ) -> None:
         """Take a position of the antenna: degrees, ellipsoidal metres, nine numbers East-North-Up (m2, row-major).
 
         ``covariance_type`` and ``status`` as in NavSatFix. An unknown or all-zero covariance takes the table
-        ``gnss.status_std_horizontal`` and ``_vertical``.
+        ``gnss.status_std_horizontal`` and ``_vertical``. ``frame_id`` tells which antenna it is.
         """
         gnss = self.parameters.gnss
         matrix = np.ascontiguousarray(covariance, np.float64)
@@ -384,14 +392,20 @@ class Navigator:
             abs(latitude_deg) > 90.0 or abs(longitude_deg) > 360.0 or abs(altitude) > HIGHEST_ALTITUDE
         ):
             aid["door"] = Verdict.BAD_VALUE
-        self._push_aid(Stream.GNSS_POSITION, stamp + self._gnss_offset, arrival)
+        self._push_gnss(Stream.GNSS_POSITION, stamp, arrival, frame_id)
 
     def push_gnss_velocity(
-        self, stamp: int, velocity_enu: Sequence[float], covariance: Sequence[float] | FloatArray, arrival: int = 0
+        self,
+        stamp: int,
+        velocity_enu: Sequence[float],
+        covariance: Sequence[float] | FloatArray,
+        arrival: int = 0,
+        frame_id: str = "",
     ) -> None:
         """Take a velocity of the antenna relative to the Earth: East-North-Up m/s, nine numbers m2/s2 (row-major).
 
-        An all-zero or absent covariance (first number negative) becomes ``gnss.unknown_velocity_std``.
+        An all-zero or absent covariance (first number negative) becomes ``gnss.unknown_velocity_std``. ``frame_id``
+        tells which antenna it is.
         """
         gnss = self.parameters.gnss
         matrix = np.ascontiguousarray(covariance, np.float64)
@@ -404,7 +418,7 @@ class Navigator:
             aid["door"] = Verdict.DISABLED
         elif aid["door"] == Verdict.WAITING and max(map(abs, values)) > HIGHEST_SPEED:
             aid["door"] = Verdict.BAD_VALUE
-        self._push_aid(Stream.GNSS_VELOCITY, stamp + self._gnss_offset, arrival)
+        self._push_gnss(Stream.GNSS_VELOCITY, stamp, arrival, frame_id)
 
     def take_records(self) -> np.ndarray:
         """Return the records (RECORD) that became final since the last call: in the total order, the too late last."""
@@ -532,23 +546,32 @@ class Navigator:
             self._stand_ins += 1
         return aid
 
-    def _push_aid(self, stream: Stream, stamp: int, arrival: int) -> None:
+    def _push_gnss(self, stream: Stream, stamp: int, arrival: int, frame_id: str) -> None:
+        """Sort the record that is on offer into the timeline, as one of the receiver with this frame."""
+        second = self.parameters.second_gnss
+        is_second = second.frame_id != "" and frame_id == second.frame_id
+        offset = second.time_offset if is_second else self.parameters.gnss.time_offset
+        self._push_aid(stream, stamp + round(offset * SECOND), arrival, int(is_second))
+
+    def _push_aid(self, stream: Stream, stamp: int, arrival: int, source: int = 0) -> None:
         """Sort the record that is on offer into the timeline."""
         self._offered_count[stream] += 1
         aid = self._offered[0]
+        aid["source"] = source
         aid["stamp"], aid["arrival"], aid["stream"], aid["verdict"] = stamp, arrival, stream, aid["door"]
         self._make_room()
         refused = insert_aid(self._aids, self._timeline, self._offered)
         if refused:
-            self._refuse(stream, stamp, arrival, Verdict(refused))
+            self._refuse(stream, stamp, arrival, source, Verdict(refused))
 
-    def _refuse(self, stream: Stream, stamp: int, arrival: int, verdict: Verdict) -> None:
+    def _refuse(self, stream: Stream, stamp: int, arrival: int, source: int, verdict: Verdict) -> None:
         """Record a measurement that never enters the timeline."""
         frontier = int(self._timeline["frontier"][0])
         if frontier != NEVER:
             self._refused_count[stream] += 1
             self._stamp_difference[stream] = (stamp - frontier) / SECOND
-        self._refused.append(np.array([(stamp, arrival, stream, verdict, 0, math.nan, (math.nan,) * 3)], RECORD))
+        record = (stamp, arrival, stream, source, verdict, 0, math.nan, (math.nan,) * 3)
+        self._refused.append(np.array([record], RECORD))
 
     def _take_records(self, everything: bool) -> np.ndarray:
         records = allocate(RECORD, max(1, int(self._timeline["aid_count"][0] - self._timeline["recorded"][0])))
@@ -625,8 +648,12 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
     imu_to_base = np.array(to_matrix(from_roll_pitch_yaw(roll, pitch, yaw)))
     settings["imu_to_base"] = imu_to_base
     settings["imu_position_base"] = imu.mount_position
-    settings["lever_arm_body"] = imu_to_base.T @ np.subtract(parameters.gnss.lever_arm, imu.mount_position)
-    settings["gate"][0, 1:] = chdtri([1, 2, 3], 1.0 - parameters.gnss.gate_probability)
+    lever_arms_base = np.subtract([parameters.gnss.lever_arm, parameters.second_gnss.lever_arm], imu.mount_position)
+    settings["lever_arms_body"] = lever_arms_base @ imu_to_base
+    for stream in (Stream.GNSS_POSITION, Stream.GNSS_VELOCITY):
+        settings["gate"][0, stream, 1:] = chdtri([1, 2, 3], 1.0 - parameters.gnss.gate_probability)
+    settings["correlated_share"] = parameters.gnss.correlated_share
+    place_optional_states(settings[0], parameters)
     settings["static_duration"] = alignment.static_duration
     settings["moving_start_after"] = alignment.moving_start_after
     settings["still_gyro_std"] = alignment.still_gyro_std
@@ -634,8 +661,31 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
     settings["moving_tilt_std"] = math.radians(alignment.moving_tilt_std_deg)
     settings["initial_heading"] = math.radians(alignment.initial_heading_deg)
     settings["initial_heading_std"] = math.radians(alignment.initial_heading_std_deg)
+    settings["use_course"] = alignment.use_course
+    settings["found_heading_std"] = math.radians(alignment.found_heading_std_deg)
     settings["course_min_speed"] = alignment.course_min_speed
     settings["course_std"] = math.radians(alignment.course_std_deg)
     settings["good_heading_std"] = math.radians(alignment.good_heading_std_deg)
     settings["output_interval"] = round(SECOND / output_rate) if output_rate > 0.0 else 0
     return settings
+
+
+def place_optional_states(settings: np.void, parameters: Parameters) -> None:
+    """Give the optional states that are switched on their places and their models, and the streams their reach."""
+    settings["reach"] = end = ERROR_SIZE
+    time = parameters.gnss.correlation_time
+    # Name, whether it is on, first deviation, driving noise, correlation time (0: random walk), streams that need it.
+    blocks: tuple[tuple[str, bool, float, float, float, tuple[Stream, ...]], ...] = (
+        ("position_error", time > 0.0, 1.0, math.sqrt(2.0 / time) if time else 0.0, time, (Stream.GNSS_POSITION,)),
+    )
+    for name, is_on, std, noise_density, time, streams in blocks:
+        settings[f"{name}_at"] = end if is_on else NOWHERE
+        if not is_on:
+            continue
+        place = slice(end - ERROR_SIZE, end - ERROR_SIZE + OPTIONAL_SIZES[name])
+        settings["optional_std"][place] = std
+        settings["optional_noise_density"][place] = noise_density
+        settings["optional_decay"][place] = 1.0 / time if time > 0.0 else 0.0
+        end += OPTIONAL_SIZES[name]
+        for stream in streams:
+            settings["reach"][stream] = end

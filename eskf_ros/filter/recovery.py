@@ -2,6 +2,9 @@
 
 Where the IMU was worse than its parameters say, a filter that ignores the first fix outside the gate ignores all that
 follow: its error and its sigma grow alike.
+
+A receiver whose accuracy changes at once has another kind of solution (single, float, fixed), and what lasted in the
+error of the old one says nothing about the new one.
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ import math
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment import restart
 from eskf_ros.filter.layout import NEVER, Verdict
+from eskf_ros.filter.optional import renew
 from eskf_ros.filter.update import project, update
 
 FUSED = int(Verdict.FUSED)
@@ -25,6 +29,20 @@ NEAR_GATE = 4.0
 """Up to so many times the gate (twice the innovation) a filter may be too sure of itself; beyond, the fix is wrong."""
 
 
+SAME_SOLUTION = 4.0
+"""A variance changes by no more than this factor from one fix to the next of the same kind of solution."""
+
+
+@njit
+def watch_solution(state, aid, settings):
+    """Begin again with the lasting error of the fixes when the receiver changes its kind of solution."""
+    variance = aid.payload[3] + aid.payload[6]
+    last = state.last_fix_variance[aid.source]
+    if settings.position_error_at < state.error_size and max(variance, last) > SAME_SOLUTION * min(variance, last):
+        renew(state, settings.position_error_at, 3, settings)
+    state.last_fix_variance[aid.source] = variance
+
+
 @njit
 def is_near_gate(verdict, nis, gate):
     """Say whether a rejected fix is close enough to the gate to be weighed down instead."""
@@ -34,7 +52,7 @@ def is_near_gate(verdict, nis, gate):
 @njit
 def update_weighed_down(state, size, excess, work):
     """Fuse what ``work`` describes with so much more noise that its NIS, ``excess`` gates, is on the gate."""
-    project(state.covariance, size, work)
+    project(state, size, work)
     for a in range(size):
         for b in range(size):
             work.noise[a, b] += (excess - 1.0) * work.innovation_covariance[a, b]

@@ -11,9 +11,14 @@ coning and sculling; Savage, Strapdown Analytics, ch. 7; Groves, sections 5.5 an
 
 from __future__ import annotations
 
+import math
+
 from eskf_ros.compiled import njit
 from eskf_ros.earth import STANDARD_GRAVITY, normal_gravity_ecef
+from eskf_ros.filter import optional
 from eskf_ros.filter.covariance import add_noise, propagate_covariance
+from eskf_ros.filter.heading_search import predict_search
+from eskf_ros.filter.layout import ERROR_SIZE
 from eskf_ros.rotation import cross, dot, from_rotation_vector, multiply, normalized, rotate, rotate_back, to_matrix
 
 SECOND = 1_000_000_000
@@ -118,6 +123,7 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
         # The direction of the measured acceleration in the map is unknown: position and velocity live on GNSS alone.
         coupling = 0.0
         acceleration = (force[0] + gravity[0], force[1] + gravity[1], force[2] + gravity[2])
+        predict_search(state, acceleration, math.sqrt(dot(angle, angle)) / dt, dt, settings)
         velocity_noise += WANDER_TIME * (WANDER_ACCELERATION**2 + dot(acceleration, acceleration))
     for i in range(3):
         new_velocity = v[i] + coupling * (dv[i] - 0.5 * dt * turn[i] + dt * (gravity[i] - 2.0 * coriolis[i]))
@@ -128,8 +134,11 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
     attitude = turned(attitude, angle, earth_rate, dt)
     for i in range(4):
         state.attitude[i] = attitude[i]
-    propagate_covariance(state.covariance, middle, force, gravity, earth_rate, dt, coupling, work)
+    size = state.error_size
+    propagate_covariance(state.covariance, size, middle, force, gravity, earth_rate, dt, coupling, work)
     add_noise(state.covariance, velocity_noise, attitude_noise, dt, settings)
+    if size > ERROR_SIZE:
+        optional.wander(state, dt, settings)
 
 
 @njit

@@ -25,8 +25,11 @@ OUTSIDE_HISTORY = int(Verdict.OUTSIDE_HISTORY)
 EARLY_AIDS = 4096
 """So many aids may wait for the first IMU sample."""
 
-CHECKPOINT_SPACING = 8
-"""IMU samples from one checkpoint to the next: what a rewind does again in vain, at the most."""
+CHECKPOINT_SPACING = 16
+"""IMU samples from one checkpoint to the next: what a rewind does again in vain, at the most.
+
+A copy of the state costs as much as half a sample.
+"""
 
 LARGEST_FORCE = 1000.0
 LARGEST_RATE = 100.0
@@ -158,11 +161,13 @@ def is_smaller_sample(force, rate, other):
 
 @njit
 def comes_before(a, b):
-    """Say whether aid ``a`` comes before aid ``b``: stamp, stream, whether the door let it in, payload."""
+    """Say whether aid ``a`` comes before aid ``b``: stamp, stream, source, whether the door let it in, payload."""
     if a.stamp != b.stamp:
         return a.stamp < b.stamp
     if a.stream != b.stream:
         return a.stream < b.stream
+    if a.source != b.source:
+        return a.source < b.source
     if a.door != b.door:
         return a.door < b.door
     for i in range(len(a.payload)):
@@ -199,11 +204,12 @@ def insert_aid(aids, timeline, offered):
 
 @njit
 def is_duplicate(aids, i):
-    """Say whether an earlier message of the same stream has the same stamp."""
+    """Say whether an earlier message of the same source and stream has the same stamp."""
     if i == 0:
         return False
-    other = aids[i - 1]
-    return other.stamp == aids[i].stamp and other.stream == aids[i].stream and other.door == 0
+    aid, other = aids[i], aids[i - 1]
+    is_same = other.stamp == aid.stamp and other.stream == aid.stream and other.source == aid.source
+    return is_same and other.door == 0
 
 
 @njit
@@ -261,6 +267,7 @@ def take_final(aids, timeline, out, everything):
         out[count].stamp = aid.stamp
         out[count].arrival = aid.arrival
         out[count].stream = aid.stream
+        out[count].source = aid.source
         out[count].verdict = aid.verdict
         out[count].dof = aid.dof
         out[count].nis = aid.nis

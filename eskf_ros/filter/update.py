@@ -24,8 +24,7 @@ def update(state, size, gate, work):
     ``gate`` is the largest normalised innovation squared that is accepted. Joseph form with the full product
     (I - K H) P (I - K H)' + K R K' (Groves, eq. 3.58), evaluated through its rank-``size`` parts.
     """
-    covariance = state.covariance
-    project(covariance, size, work)
+    project(state, size, work)
     if not invert_positive(work.innovation_covariance, size):
         return BAD_COVARIANCE, np.nan
     inverse = work.innovation_covariance
@@ -35,7 +34,7 @@ def update(state, size, gate, work):
             nis += work.innovation[a] * inverse[a, b] * work.innovation[b]
     if not nis <= gate:
         return GATE, nis
-    for i in range(ERROR_SIZE):
+    for i in range(state.error_size):
         correction = 0.0
         for a in range(size):
             gain = 0.0
@@ -44,29 +43,30 @@ def update(state, size, gate, work):
             work.gain[i, a] = gain
             correction += gain * work.innovation[a]
         work.correction[i] = correction
-    joseph(covariance, size, work)
+    joseph(state, size, work)
     inject(state, work.correction)
     # The error is now about the injected attitude (Sola, section 6.3.1, with the full Jacobian).
     turn = (work.correction[ATTITUDE], work.correction[ATTITUDE + 1], work.correction[ATTITUDE + 2])
-    transform_error(covariance, ATTITUDE, left_jacobian(turn))
+    transform_error(state.covariance, ATTITUDE, left_jacobian(turn))
     return FUSED, nis
 
 
 @njit
-def project(covariance, size, work):
+def project(state, size, work):
     """Write H P to ``work.projected`` and H P H' + R to ``work.innovation_covariance``."""
+    covariance, n = state.covariance, state.error_size
     for a in range(size):
-        for j in range(ERROR_SIZE):
+        for j in range(n):
             work.projected[a, j] = 0.0
-        for i in range(ERROR_SIZE):
+        for i in range(n):
             h = work.jacobian[a, i]
             if h != 0.0:
-                for j in range(ERROR_SIZE):
+                for j in range(n):
                     work.projected[a, j] += h * covariance[i, j]
     for a in range(size):
         for b in range(a + 1):
             total = work.noise[a, b]
-            for j in range(ERROR_SIZE):
+            for j in range(n):
                 total += work.projected[a, j] * work.jacobian[b, j]
             work.innovation_covariance[a, b] = total
             work.innovation_covariance[b, a] = total
@@ -97,24 +97,24 @@ def invert_positive(matrix, size):
 
 
 @njit
-def joseph(covariance, size, work):
+def joseph(state, size, work):
     """Replace P by (I - K H) P (I - K H)' + K R K', exactly symmetric."""
-    gain = work.gain
-    for i in range(ERROR_SIZE):
+    covariance, n, gain = state.covariance, state.error_size, work.gain
+    for i in range(n):
         for a in range(size):
             k = gain[i, a]
-            for j in range(ERROR_SIZE):
+            for j in range(n):
                 covariance[i, j] -= k * work.projected[a, j]
     # ``covariance`` is (I - K H) P now. Both terms on the right are (this H' - K R) K'.
-    for i in range(ERROR_SIZE):
+    for i in range(n):
         for a in range(size):
             total = 0.0
-            for j in range(ERROR_SIZE):
+            for j in range(n):
                 total += covariance[i, j] * work.jacobian[a, j]
             for b in range(size):
                 total -= gain[i, b] * work.noise[b, a]
             work.residual_gain[i, a] = total
-    for i in range(ERROR_SIZE):
+    for i in range(n):
         for j in range(i + 1):
             total = covariance[i, j]
             for a in range(size):
@@ -135,3 +135,5 @@ def inject(state, correction):
     attitude = normalized(multiply(turn, (state.attitude[0], state.attitude[1], state.attitude[2], state.attitude[3])))
     for i in range(4):
         state.attitude[i] = attitude[i]
+    for i in range(state.error_size - ERROR_SIZE):
+        state.optional[i] += correction[ERROR_SIZE + i]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.layout import ERROR_SIZE
+from eskf_ros.filter.layout import ERROR_CAPACITY
 from eskf_ros.rotation import rotate, rotate_back
 
 
@@ -11,7 +11,7 @@ from eskf_ros.rotation import rotate, rotate_back
 def clear(work):
     """Zero Jacobian and noise."""
     for i in range(3):
-        for j in range(ERROR_SIZE):
+        for j in range(ERROR_CAPACITY):
             work.jacobian[i, j] = 0.0
         for j in range(3):
             work.noise[i, j] = 0.0

@@ -2,14 +2,19 @@
 
 Payload: latitude, longitude (rad), ellipsoidal altitude (m), covariance in East-North-Up at the fix (m2: ee, en, eu,
 nn, nu, uu). Groves, section 14.3.1, for the local frame and a map-side attitude error.
+
+A share of the variance may belong to an error that lasts: per axis it is the standard deviation of the fix times the
+root of the share times an optional state of unit variance (first-order Gauss-Markov).
 """
 
 from __future__ import annotations
 
+import math
+
 from eskf_ros.compiled import njit
 from eskf_ros.earth import east_north_up_to_ecef, geodetic_to_ecef
 from eskf_ros.filter.aiding.common import clear, set_east_north_up_covariance, set_identity, set_minus_cross
-from eskf_ros.filter.layout import ATTITUDE, POSITION
+from eskf_ros.filter.layout import ATTITUDE, ERROR_SIZE, POSITION
 from eskf_ros.rotation import rotate, rotate_back, to_matrix
 
 SIZE = 3
@@ -24,23 +29,39 @@ def position_of_fix(state, payload):
 
 
 @njit
-def predict(state, settings):
-    """Return the map position (m) of the antenna: position + R lever_arm."""
-    lever = rotate(to_matrix(state.attitude), settings.lever_arm_body)
+def predict(state, source, settings):
+    """Return the map position (m) of the antenna of receiver ``source``: position + R lever_arm."""
+    lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[source])
     return (state.position_map[0] + lever[0], state.position_map[1] + lever[1], state.position_map[2] + lever[2])
 
 
 @njit
-def linearize(state, payload, settings, work):
+def add_lasting_error(state, settings, work):
+    """Give the share of the noise that lasts to its optional states, if they are in use."""
+    place = settings.position_error_at
+    if place >= state.error_size:
+        return
+    for i in range(SIZE):
+        std = math.sqrt(settings.correlated_share * work.noise[i, i])
+        work.jacobian[i, place + i] = std
+        work.innovation[i] -= std * state.optional[place - ERROR_SIZE + i]
+    for i in range(SIZE):
+        for j in range(SIZE):
+            work.noise[i, j] *= 1.0 - settings.correlated_share
+
+
+@njit
+def linearize(state, payload, source, settings, work):
     """Write innovation, Jacobian and noise of one fix to ``work``; return the number of scalars."""
     clear(work)
     measured = position_of_fix(state, payload)
-    predicted = predict(state, settings)
+    predicted = predict(state, source, settings)
     for i in range(3):
         work.innovation[i] = measured[i] - predicted[i]
     set_identity(work.jacobian, POSITION)
     set_east_north_up_covariance(work.noise, state, east_north_up_to_ecef(payload[0], payload[1]), payload, 3)
-    lever = rotate(to_matrix(state.attitude), settings.lever_arm_body)
+    add_lasting_error(state, settings, work)
+    lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[source])
     if state.heading_known == 0:
         # The lever arm points anywhere around the vertical: its horizontal length is an error of the prediction.
         for i in range(2):

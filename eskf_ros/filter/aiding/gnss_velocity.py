@@ -38,27 +38,27 @@ def body_rate(state, rotation):
 
 
 @njit
-def predict(state, settings):
-    """Return the velocity (m/s, map) of the antenna."""
+def predict(state, source, settings):
+    """Return the velocity (m/s, map) of the antenna of receiver ``source``."""
     rotation = to_matrix(state.attitude)
-    sway = rotate(rotation, cross(body_rate(state, rotation), settings.lever_arm_body))
+    sway = rotate(rotation, cross(body_rate(state, rotation), settings.lever_arms_body[source]))
     return (state.velocity_map[0] + sway[0], state.velocity_map[1] + sway[1], state.velocity_map[2] + sway[2])
 
 
 @njit
-def linearize(state, payload, settings, work):
+def linearize(state, payload, source, settings, work):
     """Write innovation, Jacobian and noise of one velocity to ``work``; return the number of scalars."""
     clear(work)
     local_to_ecef = local_east_north_up_to_ecef(state)
     measured = rotate_back(state.map_to_ecef, rotate(local_to_ecef, (payload[0], payload[1], payload[2])))
-    predicted = predict(state, settings)
+    predicted = predict(state, source, settings)
     for i in range(3):
         work.innovation[i] = measured[i] - predicted[i]
     set_identity(work.jacobian, VELOCITY)
     set_east_north_up_covariance(work.noise, state, local_to_ecef, payload, 3)
 
     rotation = to_matrix(state.attitude)
-    arm = settings.lever_arm_body
+    arm = settings.lever_arms_body[source]
     lever = rotate(rotation, arm)
     sway = rotate(rotation, cross(body_rate(state, rotation), arm))
     # The gyro reading of this instant carries the white noise of one sample.
