@@ -50,7 +50,7 @@ class DualAntenna:
         east, north, _ = np.einsum("nji,nj->in", enu_to_ecef, baseline_ecef)
         yaw = np.arctan2(north, east) + math.radians(self.yaw_std_deg) * noise_stream.standard_normal(len(stamp))
         arrival = arrivals(stamp, self.latency, arrival_stream)
-        kept = received(episodes, section.elapsed(stamp))
+        kept = received(episodes, (1, 2), section.elapsed(stamp))
         wrapped = np.remainder(yaw + math.pi, 2.0 * math.pi) - math.pi
         return DualAntennaMeasurements(self, stamp[kept], arrival[kept], wrapped[kept])
 

@@ -1,7 +1,8 @@
 """A simulated GNSS receiver: position and velocity of the antenna at regular epochs, each with its covariance.
 
-The errors are white and exactly as the covariances say. Position and velocity of an epoch share the stamp; both arrive
-late by a latency that differs from epoch to epoch, the velocity shortly after the position.
+The errors are white and exactly as the covariances say, unless episodes (`eskf_ros.simulate.gnss_episodes`) change
+that. Position and velocity of an epoch share the stamp; both arrive late by a latency that differs from epoch to epoch,
+the velocity shortly after the position.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.simulate.episodes import Episode, received
+from eskf_ros.simulate.gnss_episodes import GnssEpisode, GnssReport
 from eskf_ros.simulate.map_frame import east_north_up_to_ecef, to_geodetic
 from eskf_ros.simulate.motion import Vector
 from eskf_ros.simulate.sampling import Interval, Section, Stamps, arrivals, check_rate, generators
@@ -29,10 +31,11 @@ VELOCITY_AFTER_POSITION = (0.0002, 0.002)
 
 
 class GnssStreams(NamedTuple):
-    """Where the random numbers of a receiver come from: errors and delays of positions and velocities."""
+    """Where the random numbers of a receiver come from: errors, those of episodes, delays."""
 
     position: np.random.Generator
     velocity: np.random.Generator
+    episodes: np.random.Generator
     fix_delay: np.random.Generator
     velocity_delay: np.random.Generator
 
@@ -56,19 +59,28 @@ class GnssReceiver:
         check_rate("rate of the GNSS receiver", self.rate)
 
     def measure(self, section: Section, episodes: Sequence[Episode], seed: np.random.SeedSequence) -> GnssMeasurements:
-        """Return what the receiver gives in ``section``; of ``episodes`` those of GNSS count."""
-        return self.measure_with(section, episodes, GnssStreams(*generators(seed, 4)))
+        """Return what the second receiver gives in ``section``; of ``episodes`` those of GNSS count."""
+        return self.measure_as(2, section, episodes, GnssStreams(*generators(seed, 5)))
 
-    def measure_with(self, section: Section, episodes: Sequence[Episode], streams: GnssStreams) -> GnssMeasurements:
-        """Return what `measure` does, from given random streams."""
+    def measure_as(
+        self, receiver: int, section: Section, episodes: Sequence[Episode], streams: GnssStreams
+    ) -> GnssMeasurements:
+        """Return what this gives as the first or second ``receiver``, from given random streams."""
         stamp = section.stamps(self.rate, GNSS_PHASE)
         motion = section.motion(stamp)
         position_ecef = section.frame.to_ecef(motion.position_of(self.lever_arm))
         velocity_ecef = motion.velocity_of(self.lever_arm) @ section.frame.rotation_map_to_ecef.T
         enu_to_ecef = east_north_up_to_ecef(to_geodetic(position_ecef))
 
-        position_error = streams.position.standard_normal(position_ecef.shape) * axis_stds(self.position_std)
-        velocity_error = streams.velocity.standard_normal(position_ecef.shape) * axis_stds(self.velocity_std)
+        elapsed = section.elapsed(stamp)
+        report = GnssReport.faultless(elapsed, self.position_std, self.velocity_std)
+        for episode in episodes:
+            if isinstance(episode, GnssEpisode) and episode.receiver in (0, receiver):
+                episode.apply(report, streams.episodes)
+        position_error = streams.position.standard_normal(position_ecef.shape) * report.position_std
+        velocity_error = streams.velocity.standard_normal(position_ecef.shape) * report.velocity_std
+        position_error += report.position_offset
+        velocity_error += report.velocity_offset
         geodetic = to_geodetic(position_ecef + np.einsum("nij,nj->ni", enu_to_ecef, position_error))
         geodetic[:, :2] *= 180.0 / math.pi
         velocity_enu = np.einsum("nji,nj->ni", enu_to_ecef, velocity_ecef) + velocity_error
@@ -76,19 +88,20 @@ class GnssReceiver:
         fix_arrival = arrivals(stamp, self.latency, streams.fix_delay)
         velocity_arrival = arrivals(fix_arrival, VELOCITY_AFTER_POSITION, streams.velocity_delay)
         # Outages only remove messages, so that what lies outside of them does not depend on them.
-        kept = received(episodes, section.elapsed(stamp))
-        count = int(kept.sum())
+        kept = received(episodes, (receiver,), elapsed)
         return GnssMeasurements(
             fix_stamp=stamp[kept],
             fix_arrival=fix_arrival[kept],
             fix_latitude_deg=geodetic[kept, 0],
             fix_longitude_deg=geodetic[kept, 1],
             fix_altitude=geodetic[kept, 2],
-            fix_covariance=np.tile(np.diag(axis_stds(self.position_std) ** 2).ravel(), (count, 1)),
+            fix_status=report.status[kept],
+            fix_covariance=_diagonal(report.reported_position_std[kept]),
+            fix_covariance_type=report.covariance_type[kept],
             velocity_stamp=stamp[kept],
             velocity_arrival=velocity_arrival[kept],
             velocity_enu=velocity_enu[kept],
-            velocity_covariance=np.tile(np.diag(axis_stds(self.velocity_std) ** 2).ravel(), (count, 1)),
+            velocity_covariance=_diagonal(report.reported_velocity_std[kept]),
         )
 
 
@@ -97,8 +110,8 @@ class GnssMeasurements:
     """What a receiver gave and when it arrived (``*_arrival``), one row per message.
 
     Stamps and arrivals are int64 ns. Position of the antenna: latitude and longitude in degrees, ellipsoidal altitude
-    in m. ``velocity_enu`` (n, 3) in m/s and both covariances, row-major (n, 9) in m2 and m2/s2, have the axes east,
-    north, up at the antenna.
+    in m. ``fix_status`` and ``fix_covariance_type`` are as in NavSatFix. ``velocity_enu`` (n, 3) in m/s and both
+    covariances, row-major (n, 9) in m2 and m2/s2, have the axes east, north, up at the antenna.
     """
 
     fix_stamp: Stamps
@@ -106,13 +119,17 @@ class GnssMeasurements:
     fix_latitude_deg: Array
     fix_longitude_deg: Array
     fix_altitude: Array
+    fix_status: NDArray[np.int8]
     fix_covariance: Array
+    fix_covariance_type: NDArray[np.uint8]
     velocity_stamp: Stamps
     velocity_arrival: Stamps
     velocity_enu: Array
     velocity_covariance: Array
 
 
-def axis_stds(horizontal_vertical: tuple[float, float]) -> Array:
-    """Return the standard deviations east, north, up (3,) of a horizontal and a vertical one."""
-    return np.array([horizontal_vertical[0], horizontal_vertical[0], horizontal_vertical[1]])
+def _diagonal(stds: Array) -> Array:
+    """Return the covariances (n, 9) of independent axes with ``stds`` (n, 3)."""
+    covariances = np.zeros((len(stds), 9))
+    covariances[:, ::4] = stds**2
+    return covariances

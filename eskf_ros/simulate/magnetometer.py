@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.simulate.episodes import Episode, MagneticDisturbance, covers
+from eskf_ros.simulate.episodes import Episode, MagneticDisturbance
 from eskf_ros.simulate.map_frame import east_north_up_to_ecef, to_geodetic
 from eskf_ros.simulate.motion import Vector, mounting
 from eskf_ros.simulate.sampling import Interval, Section, Stamps, arrivals, check_rate, generators
@@ -63,7 +63,7 @@ class Magnetometer:
         field_map = enu_to_ecef @ self.field_enu @ section.frame.rotation_map_to_ecef
         for episode in episodes:
             if isinstance(episode, MagneticDisturbance):
-                field_map[covers(episode, section.elapsed(stamp))] += episode.field
+                field_map[episode.covers(section.elapsed(stamp))] += episode.field
         hard_iron = np.array(self.hard_iron) + self.hard_iron_std * iron_stream.standard_normal(3)
         field_body = np.einsum("nji,nj->ni", motion.rotation_body_to_map, field_map)
         noise = self.noise_std * noise_stream.standard_normal(field_body.shape)

@@ -14,11 +14,10 @@ import numpy as np
 
 from eskf_ros.bags import BagError, BagWriter
 from eskf_ros.simulate import spelled
-from eskf_ros.simulate.episodes import EPISODES
 from eskf_ros.simulate.frames import STRINGS
 from eskf_ros.simulate.imu import GRADES
 from eskf_ros.simulate.messages import Topic, topics_of
-from eskf_ros.simulate.recording import AIDS
+from eskf_ros.simulate.recording import AIDS, EPISODES
 from eskf_ros.simulate.scenario import SCENARIOS, Options, Recording, simulate
 
 _BLOCK_NANOSECONDS = 60_000_000_000

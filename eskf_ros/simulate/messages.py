@@ -20,9 +20,7 @@ from eskf_ros.simulate.recording import Recording
 
 Array = NDArray[np.float64]
 
-_STATUS_FIX = 0
 _SERVICE_GPS = 1
-_COVARIANCE_DIAGONAL_KNOWN = 2
 
 _AIDS: dict[str, tuple[str, str, Callable[[Any, slice], NDArray[Any]]]] = {
     "dual_antenna": ("gnss/heading", "sensor_msgs/msg/Imu", aid_messages.dual_antenna),
@@ -92,13 +90,13 @@ def _fixes(gnss: GnssMeasurements, frame: Frame, part: slice) -> NDArray[Any]:
     messages = np.zeros(len(gnss.fix_stamp[part]), message_dtype("sensor_msgs/msg/NavSatFix"))
     messages["stamp"] = gnss.fix_stamp[part]
     messages["frame_id"] = frame
-    messages["status"] = _STATUS_FIX
+    messages["status"] = gnss.fix_status[part]
     messages["service"] = _SERVICE_GPS
     messages["latitude"] = gnss.fix_latitude_deg[part]
     messages["longitude"] = gnss.fix_longitude_deg[part]
     messages["altitude"] = gnss.fix_altitude[part]
     messages["position_covariance"] = gnss.fix_covariance[part]
-    messages["position_covariance_type"] = _COVARIANCE_DIAGONAL_KNOWN
+    messages["position_covariance_type"] = gnss.fix_covariance_type[part]
     return messages
 
 
@@ -110,8 +108,8 @@ def _velocities(gnss: GnssMeasurements, frame: Frame, part: slice) -> NDArray[An
     messages["linear_velocity"] = gnss.velocity_enu[part]
     covariance = np.zeros((count, 6, 6))
     covariance[:, :3, :3] = gnss.velocity_covariance[part].reshape(-1, 3, 3)
-    # The receiver does not measure rotation.
-    covariance[:, 3, 3] = -1.0
+    # The receiver does not measure rotation; one that leaves its covariances zero does not say so either.
+    covariance[:, 3, 3] = np.where(gnss.velocity_covariance[part].any(axis=1), -1.0, 0.0)
     messages["twist_covariance"] = covariance.reshape(-1, 36)
     return messages
 

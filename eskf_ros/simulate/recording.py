@@ -11,8 +11,19 @@ from numpy.typing import NDArray
 from eskf_ros.simulate.barometer import Barometer, BarometerMeasurements
 from eskf_ros.simulate.body_velocity import BodyVelocity, BodyVelocityMeasurements
 from eskf_ros.simulate.dual_antenna import DualAntenna, DualAntennaMeasurements
-from eskf_ros.simulate.episodes import Episode
+from eskf_ros.simulate.episodes import Episode, MagneticDisturbance, Outage, WheelSlip
 from eskf_ros.simulate.gnss import GnssMeasurements, GnssReceiver
+from eskf_ros.simulate.gnss_episodes import (
+    BadFixes,
+    ClaimedStd,
+    CorrelatedErrors,
+    GnssEpisode,
+    Multipath,
+    Overconfidence,
+    RtkSolution,
+    Spoofing,
+    ZeroCovariance,
+)
 from eskf_ros.simulate.imu import grade_parameters
 from eskf_ros.simulate.magnetometer import Magnetometer, MagnetometerMeasurements
 from eskf_ros.simulate.map_frame import MapFrame
@@ -32,6 +43,21 @@ AIDS = {
 }
 """The sensors there may be besides an IMU and a GNSS receiver, by their names in `Options` and in `Recording`."""
 
+EPISODES = {
+    "outage": Outage,
+    "bad_fixes": BadFixes,
+    "multipath": Multipath,
+    "spoofing": Spoofing,
+    "correlated_errors": CorrelatedErrors,
+    "rtk_solution": RtkSolution,
+    "overconfidence": Overconfidence,
+    "claimed_std": ClaimedStd,
+    "zero_covariance": ZeroCovariance,
+    "wheel_slip": WheelSlip,
+    "magnetic_disturbance": MagneticDisturbance,
+}
+"""The kinds of episodes as the command line names them."""
+
 
 @dataclass(frozen=True)
 class Options:
@@ -46,8 +72,8 @@ class Options:
     ``lever_arm``, ``gnss_rate``, ``position_std``, ``velocity_std``, ``latency``: the first GNSS receiver, see
     `eskf_ros.simulate.gnss.GnssReceiver`. The sensors that are None are not there. ``outages``: intervals (first,
     last) in seconds from time zero without GNSS; None takes the scenario's. ``episodes``: what else goes wrong, see
-    `eskf_ros.simulate.episodes`. ``start`` and ``stop``: the part of the scenario that is recorded, in seconds from
-    time zero; ``stop`` None is its end.
+    `eskf_ros.simulate.episodes` and `eskf_ros.simulate.gnss_episodes`. ``start`` and ``stop``: the part of the scenario
+    that is recorded, in seconds from time zero; ``stop`` None is its end.
     """
 
     grade: str = "industrial"
@@ -84,6 +110,9 @@ class Options:
         grade_parameters(self.grade)
         for name in ("imu_rate", "gnss_rate", "truth_rate"):
             check_rate(name, getattr(self, name))
+        for episode in self.episodes:
+            if isinstance(episode, (Outage, GnssEpisode)) and episode.receiver not in (0, 1, 2):
+                raise ValueError(f"{episode}: the receiver must be 1, 2 or, for both, 0")
 
     @property
     def first_gnss(self) -> GnssReceiver:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.simulate.episodes import Outage
+from eskf_ros.simulate.episodes import Outage, outages_of
 from eskf_ros.simulate.gnss import GnssStreams
 from eskf_ros.simulate.imu import ImuMount, SensorErrors, grade_parameters, ideal_interval_means, ideal_samples
 from eskf_ros.simulate.map_frame import MapFrame
@@ -68,20 +68,20 @@ def simulate(name: str, seed: int = 0, **options: Any) -> Recording:
         ideal.specific_force, chosen.imu_rate, seed_of(seed, RandomStream.ACCELEROMETER)
     )
     imu_delay, *gnss_delays = generators(seed_of(seed, RandomStream.ARRIVAL), 3)
-    gnss_streams = GnssStreams(*generators(seed_of(seed, RandomStream.GNSS), 2), *gnss_delays)
+    gnss_streams = GnssStreams(*generators(seed_of(seed, RandomStream.GNSS), 3), *gnss_delays)
     aids = {
         aid: sensor.measure(section, episodes, seed_of(seed, RandomStream[aid.upper()]))
         for aid in AIDS
         if (sensor := getattr(chosen, aid))
     }
     return Recording(
-        **vars(chosen.first_gnss.measure_with(section, episodes, gnss_streams)),
+        **vars(chosen.first_gnss.measure_as(1, section, episodes, gnss_streams)),
         **aids,
         name=name,
         seed=seed,
         options=chosen,
         datum=DATUM,
-        outages=tuple((gap.start, gap.start + gap.length) for gap in episodes if isinstance(gap, Outage)),
+        outages=tuple((gap.start, gap.start + gap.length) for gap in outages_of(episodes, (1,))),
         imu_stamp=ideal.imu_stamp,
         imu_arrival=arrivals(ideal.imu_stamp, IMU_LATENCY, imu_delay),
         specific_force=specific_force,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.simulate.episodes import Episode, WheelSlip, covers
+from eskf_ros.simulate.episodes import Episode, WheelSlip
 from eskf_ros.simulate.motion import Vector, rotate
 from eskf_ros.simulate.sampling import Interval, Section, Stamps, arrivals, check_rate, generators
 
@@ -59,7 +59,7 @@ class WheelOdometer:
         yaw_rate = motion.angular_rate_body[:, 2].copy()
         for episode in episodes:
             if isinstance(episode, WheelSlip):
-                slipping = covers(episode, section.elapsed(stamp))
+                slipping = episode.covers(section.elapsed(stamp))
                 speed[slipping] = episode.factor * speed[slipping] + episode.speed
                 yaw_rate[slipping] *= episode.factor
         standing = (np.abs(speed) < _STANDING) & (np.abs(yaw_rate) < _STANDING)
