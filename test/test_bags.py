@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import io
+import operator
 import shutil
 import sqlite3
 import struct
@@ -167,6 +168,32 @@ def test_encoding_is_that_of_rosbags(type_name: str, frames: int) -> None:
         assert bytes(STORE.serialize_cdr(message, type_name)) == data
 
 
+@pytest.mark.parametrize(
+    ("type_name", "places"),
+    [
+        (IMU, {"angular_velocity": "angular_velocity.x", "linear_acceleration": "linear_acceleration.x"}),
+        (FIX, {"latitude": "latitude", "longitude": "longitude", "altitude": "altitude"}),
+        ("sensor_msgs/msg/FluidPressure", {"fluid_pressure": "fluid_pressure", "variance": "variance"}),
+        (
+            "geometry_msgs/msg/TwistStamped",
+            {"linear_velocity": "twist.linear.x", "angular_velocity": "twist.angular.x"},
+        ),
+        (
+            "geometry_msgs/msg/TwistWithCovarianceStamped",
+            {"linear_velocity": "twist.twist.linear.x", "angular_velocity": "twist.twist.angular.x"},
+        ),
+        (ODOMETRY, {"pose_covariance": "pose.covariance", "twist_covariance": "twist.covariance"}),
+    ],
+)
+def test_fields_of_equal_form_are_not_taken_for_each_other(type_name: str, places: dict[str, str]) -> None:
+    messages = np.zeros(1, message_dtype(type_name))
+    for number, name in enumerate(places):
+        messages[name] = number + 1.0
+    message = STORE.deserialize_cdr(payloads(type_name, messages)[0], type_name)
+    for number, place in enumerate(places.values()):
+        assert np.ravel(operator.attrgetter(place)(message))[0] == number + 1.0
+
+
 @pytest.mark.parametrize("little_endian", [True, False])
 @pytest.mark.parametrize("type_name", MESSAGE_TYPES)
 def test_decoding_mixed_byte_orders_strings_and_damage(type_name: str, little_endian: bool) -> None:
@@ -194,11 +221,15 @@ def test_decoding_mixed_byte_orders_strings_and_damage(type_name: str, little_en
         assert found == [row for number, row in enumerate(expected) if number not in (4, 7)]
 
 
-@pytest.mark.parametrize("length", [0, 3, 11, 40])
-def test_payloads_too_short_for_their_type_are_invalid(length: int) -> None:
-    _, valid = decode(IMU, np.zeros((5, length), np.uint8), StringTable())
-    assert valid is not None
-    assert not valid.any()
+@pytest.mark.parametrize("missing", [1, 8, 1000])
+@pytest.mark.parametrize("type_name", MESSAGE_TYPES)
+def test_payloads_too_short_for_their_type_are_invalid(type_name: str, missing: int) -> None:
+    whole = np.frombuffer(payloads(type_name, random_messages(type_name, 1))[0], np.uint8)
+    for length in {0, 3, 11, max(0, len(whole) - missing)}:
+        _, valid = decode(type_name, np.tile(whole[:length], (5, 1)), StringTable())
+        assert valid is not None
+        assert not valid.any()
+    assert decode(type_name, np.tile(whole, (5, 1)), StringTable())[1] is None
 
 
 @pytest.mark.parametrize("compression", COMPRESSIONS)
@@ -499,16 +530,17 @@ def test_wrong_topics_types_and_encodings_are_named(tmp_path: Path) -> None:
             writer.write(handle, log_times(3), random_messages(IMU, 2), FRAMES)
 
 
-def test_messages_that_are_not_of_their_type_are_counted(tmp_path: Path) -> None:
-    data = payloads(IMU, random_messages(IMU, 100))
-    rows = [("/imu/data", time, row) for time, row in zip(log_times(100).tolist(), data, strict=True)]
-    rows[10] = ("/imu/data", rows[10][1], b"")
-    rows[50] = ("/imu/data", rows[50][1], rows[50][2][:-1])
-    write_library(tmp_path / "bag.mcap", rows)
+@pytest.mark.parametrize("type_name", MESSAGE_TYPES)
+def test_messages_that_are_not_of_their_type_are_counted(tmp_path: Path, type_name: str) -> None:
+    data = payloads(type_name, random_messages(type_name, 100))
+    rows = [("/topic", time, row) for time, row in zip(log_times(100).tolist(), data, strict=True)]
+    rows[10] = ("/topic", rows[10][1], b"")
+    rows[50] = ("/topic", rows[50][1], rows[50][2][:-1])
+    write_library(tmp_path / "bag.mcap", rows, type_name)
     with open_bag([tmp_path / "bag.mcap"]) as reader:
-        assert len(read(reader, {"/imu/data": IMU})["/imu/data"][0]) == 98
+        assert len(read(reader, {"/topic": type_name})["/topic"][0]) == 98
         assert len(reader.warnings) == 1
-        assert "2 messages of topic /imu/data cannot be decoded" in reader.warnings[0]
+        assert "2 messages of topic /topic cannot be decoded" in reader.warnings[0]
 
 
 def damaged_chunk(path: Path, number: int) -> tuple[int, int, int]:

@@ -13,67 +13,27 @@ import pytest
 from inertial_oracle import integrate
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from simulated import TOPICS, antenna_errors, assert_chi_square, attitude, read, seconds
 
 from eskf_ros import parameters
-from eskf_ros.bags import open_bag
 from eskf_ros.simulate import main as command
 from eskf_ros.simulate.imu import GRADES, ImuMount, SensorErrors, grade_parameters, ideal_interval_means, ideal_samples
 from eskf_ros.simulate.map_frame import MapFrame
 from eskf_ros.simulate.scenario import (
     DATUM,
     SCENARIOS,
-    START_STAMP,
     Recording,
     scenario,
     simulate,
     trajectory,
 )
-from eskf_ros.simulate.trajectory import DriveTrajectory, Hold, Motion, SpeedTo, Turn
+from eskf_ros.simulate.trajectory import DriveTrajectory, Hold, SpeedTo, Turn
 
 Array = NDArray[np.float64]
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 FRAME = MapFrame(DATUM)
 LEVER_ARM = (0.8, -0.2, 1.4)
-TOPICS = {
-    "imu/data": "sensor_msgs/msg/Imu",
-    "gps/fix": "sensor_msgs/msg/NavSatFix",
-    "gps/vel": "geometry_msgs/msg/TwistWithCovarianceStamped",
-    "truth": "nav_msgs/msg/Odometry",
-}
-
-
-def attitude(motion: Motion) -> Rotation:
-    return Rotation.from_quat(motion.attitude_body_to_map[:, [1, 2, 3, 0]])
-
-
-def assert_chi_square(normalized_errors: Array) -> None:
-    """Errors divided by their sigma have the variance 1, within what one run in 100 000 exceeds."""
-    total, count = float(np.sum(normalized_errors**2)), normalized_errors.size
-    assert chi2.ppf(5e-6, count) < total < chi2.ppf(1.0 - 5e-6, count), total / count
-
-
-def seconds(stamps: NDArray[np.int64]) -> Array:
-    return (stamps - START_STAMP) * 1e-9
-
-
-def read(path: Path) -> dict[str, tuple[NDArray[np.int64], NDArray[Any], list[list[str]]]]:
-    """Return log times, messages and their frames by topic."""
-    with open_bag([path]) as bag:
-        assert {name: info.type for name, info in bag.topics.items()} == TOPICS
-        parts: dict[str, list[Any]] = {topic: [] for topic in TOPICS}
-        for batch in bag.batches(TOPICS):
-            for topic, content in batch.items():
-                parts[topic].append((content.log_time, content.messages))
-        read_topics = {}
-        for topic, pieces in parts.items():
-            messages = np.concatenate([piece[1] for piece in pieces])
-            names = [name for name in ("frame_id", "child_frame_id") if name in (messages.dtype.names or ())]
-            frames = [sorted({bag.strings[index] for index in messages[name]}) for name in names]
-            read_topics[topic] = (np.concatenate([piece[0] for piece in pieces]), messages, frames)
-        assert not bag.warnings
-        return read_topics
 
 
 # ------------------------------------------------------------------------------------------------------- trajectory
@@ -143,7 +103,7 @@ def test_impossible_instructions_are_refused() -> None:
         DriveTrajectory([SpeedTo(5.0), SpeedTo(5.0)])
     with pytest.raises(ValueError, match="must be positive"):
         DriveTrajectory([Hold(0.0)])
-    with pytest.raises(ValueError, match="within the drive"):
+    with pytest.raises(ValueError, match="within the trajectory"):
         DriveTrajectory([Hold(2.0)]).motion(2.1)
 
 
@@ -257,31 +217,9 @@ def test_grades_are_parameters_of_the_estimator() -> None:
 # ------------------------------------------------------------------------------------------------------------- GNSS
 
 
-def antenna_errors(recording: Recording, lever_arm: tuple[float, float, float]) -> tuple[Array, Array]:
-    """Errors of position and velocity in east, north, up at the antenna, from the truth by way of pymap3d."""
-    truth = trajectory(recording.name).motion(seconds(recording.fix_stamp))
-    antenna = truth.position_map + attitude(truth).apply(lever_arm)
-    latitude, longitude, altitude = pymap3d.enu2geodetic(*antenna.T, *DATUM)
-    position_error = np.stack(
-        pymap3d.geodetic2enu(
-            recording.fix_latitude_deg,
-            recording.fix_longitude_deg,
-            recording.fix_altitude,
-            latitude,
-            longitude,
-            altitude,
-        ),
-        axis=-1,
-    )
-    velocity_map = truth.velocity_map + attitude(truth).apply(np.cross(truth.angular_rate_body, lever_arm))
-    velocity_ecef = np.stack(pymap3d.enu2ecefv(*velocity_map.T, DATUM[0], DATUM[1]), axis=-1)
-    east, north, up = pymap3d.ecef2enuv(*velocity_ecef.T, latitude, longitude)
-    return position_error, recording.velocity_enu - np.stack([east, north, up], axis=-1)
-
-
 def test_gnss_errors_are_as_their_covariance_says() -> None:
     recording = simulate("drive", seed=3)
-    position_error, velocity_error = antenna_errors(recording, LEVER_ARM)
+    position_error, velocity_error = antenna_errors(recording.name, recording, LEVER_ARM)
     for error, covariance in (
         (position_error, recording.fix_covariance),
         (velocity_error, recording.velocity_covariance),
@@ -293,7 +231,7 @@ def test_gnss_errors_are_as_their_covariance_says() -> None:
             assert_chi_square(normalized[:, axis])
         assert np.abs(np.mean(normalized[1:] * normalized[:-1], axis=0)).max() < 5.0 / math.sqrt(len(error))
     # Without the lever arm the same check fails, so it does see it: in position and, in turns, in velocity.
-    position_off, velocity_off = antenna_errors(recording, (0.0, 0.0, 0.0))
+    position_off, velocity_off = antenna_errors(recording.name, recording, (0.0, 0.0, 0.0))
     assert np.sum(position_off**2) > 1.5 * np.sum(position_error**2)
     turning = np.abs(trajectory("drive").motion(seconds(recording.fix_stamp)).angular_rate_body[:, 2]) > 0.3
     assert turning.sum() > 50
@@ -429,7 +367,7 @@ def test_command_writes_a_recording_with_truth(tmp_path: Path, capsys: pytest.Ca
     assert f"{path}: drive, seed 3, 28" in printed
     assert "gnss.lever_arm: [0.8, -0.2, 1.4]" in printed
     recording = simulate("drive", 3, imu_rate=100.0)
-    content = read(path)
+    content = read(path, TOPICS)
 
     log, imu, frames = content["imu/data"]
     assert frames == [["imu_link"]]
@@ -455,7 +393,7 @@ def test_command_writes_a_recording_with_truth(tmp_path: Path, capsys: pytest.Ca
 
 
 def test_truth_of_the_recording_is_of_base_link_in_the_earth_frame() -> None:
-    _, truth, frames = read(CHECKOUT / "bags" / "tunnel_drive.mcap")["truth"]
+    _, truth, frames = read(CHECKOUT / "bags" / "tunnel_drive.mcap", TOPICS)["truth"]
     assert frames == [["earth"], ["base_link"]]
     t = seconds(truth["stamp"])
     motion = trajectory("tunnel_drive").motion(t)
@@ -478,7 +416,7 @@ def test_truth_of_the_recording_is_of_base_link_in_the_earth_frame() -> None:
 def test_bundled_recording_is_what_the_command_makes(tmp_path: Path) -> None:
     path = tmp_path / "tunnel_drive.mcap"
     assert command.main(["tunnel_drive", "--truth-rate", "20", "--quiet", "--out", str(path)]) == 0
-    made, bundled = read(path), read(CHECKOUT / "bags" / "tunnel_drive.mcap")
+    made, bundled = read(path, TOPICS), read(CHECKOUT / "bags" / "tunnel_drive.mcap", TOPICS)
     for topic in TOPICS:
         np.testing.assert_array_equal(made[topic][0], bundled[topic][0])
         assert made[topic][2] == bundled[topic][2]

@@ -41,7 +41,8 @@ class Field:
 
 
 _HEADER = (Field("stamp", _TIME), Field("frame_id", _STRING))
-_TWIST = (Field("linear_velocity", "f8", 3), Field("angular_velocity", "f8", 3), Field("twist_covariance", "f8", 36))
+_VELOCITIES = (Field("linear_velocity", "f8", 3), Field("angular_velocity", "f8", 3))
+_TWIST = (*_VELOCITIES, Field("twist_covariance", "f8", 36))
 _POSE = (Field("position", "f8", 3), Field("orientation", "f8", 4), Field("pose_covariance", "f8", 36))
 
 MESSAGE_TYPES: dict[str, tuple[Field, ...]] = {
@@ -64,7 +65,16 @@ MESSAGE_TYPES: dict[str, tuple[Field, ...]] = {
         Field("position_covariance", "f8", 9),
         Field("position_covariance_type", "u1"),
     ),
+    "sensor_msgs/msg/MagneticField": (
+        *_HEADER,
+        Field("magnetic_field", "f8", 3),
+        Field("magnetic_field_covariance", "f8", 9),
+    ),
+    "sensor_msgs/msg/FluidPressure": (*_HEADER, Field("fluid_pressure", "f8"), Field("variance", "f8")),
+    "geometry_msgs/msg/TwistStamped": (*_HEADER, *_VELOCITIES),
     "geometry_msgs/msg/TwistWithCovarianceStamped": (*_HEADER, *_TWIST),
+    "geometry_msgs/msg/QuaternionStamped": (*_HEADER, Field("quaternion", "f8", 4)),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": (*_HEADER, *_POSE),
     "nav_msgs/msg/Odometry": (*_HEADER, Field("child_frame_id", _STRING), *_POSE, *_TWIST),
 }
 

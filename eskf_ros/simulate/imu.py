@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros import rotation
 from eskf_ros.simulate.map_frame import MapFrame
-from eskf_ros.simulate.trajectory import DriveTrajectory, cross
+from eskf_ros.simulate.motion import Trajectory, Vector, cross, mounting
+from eskf_ros.simulate.sampling import generators
 
 Array = NDArray[np.float64]
 
@@ -69,30 +69,35 @@ def grade_parameters(grade: str) -> dict[str, float]:
 class ImuMount:
     """Pose of the IMU in base_link: ``position`` (m) and fixed-axis ``rpy_deg``, as in URDF."""
 
-    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    position: Vector = (0.0, 0.0, 0.0)
+    rpy_deg: Vector = (0.0, 0.0, 0.0)
 
     @property
     def rotation_imu_to_body(self) -> Array:
         """Rotation matrix (3, 3) from IMU to base_link axes."""
-        roll, pitch, yaw = (math.radians(angle) for angle in self.rpy_deg)
-        return np.array(rotation.to_matrix(rotation.from_roll_pitch_yaw(roll, pitch, yaw)))
+        return mounting(self.rpy_deg)
 
 
 def ideal_samples(
-    trajectory: DriveTrajectory, frame: MapFrame, times: Array, mount: ImuMount | None = None
+    trajectory: Trajectory,
+    frame: MapFrame,
+    times: Array,
+    mount: ImuMount | None = None,
+    gravity_removed: bool = False,
 ) -> tuple[Array, Array]:
     """Return specific force (m/s2) and inertial angular rate (rad/s), both (n, 3) in IMU axes, at ``times`` (n,) s.
 
     f = R^T (a + 2 Omega x v - g) of the IMU's own point, and omega = rate relative to the Earth + R^T Omega: Groves,
-    section 5.3, in a frame that is fixed to the Earth; g is normal gravity, the centrifugal part included.
+    section 5.3, in a frame that is fixed to the Earth; g is normal gravity, the centrifugal part included. With
+    ``gravity_removed`` g is left out, as by a driver that gives "linear acceleration".
     """
     mount = mount or ImuMount()
     motion = trajectory.motion(times)
     body_to_map = motion.rotation_body_to_map
     coriolis = 2.0 * cross(frame.earth_rate_map, motion.velocity_of(mount.position))
-    gravity = frame.gravity_map(motion.position_of(mount.position))
-    force_map = motion.acceleration_of(mount.position) + coriolis - gravity
+    force_map = motion.acceleration_of(mount.position) + coriolis
+    if not gravity_removed:
+        force_map -= frame.gravity_map(motion.position_of(mount.position))
     force_body = np.einsum("nji,nj->ni", body_to_map, force_map)
     rate_body = motion.angular_rate_body + frame.earth_rate_map @ body_to_map
     # Row vectors times the rotation to the body are the transposed rotation: body to IMU.
@@ -100,13 +105,18 @@ def ideal_samples(
 
 
 def ideal_interval_means(
-    trajectory: DriveTrajectory, frame: MapFrame, times: Array, interval: float, mount: ImuMount | None = None
+    trajectory: Trajectory,
+    frame: MapFrame,
+    times: Array,
+    interval: float,
+    mount: ImuMount | None = None,
+    gravity_removed: bool = False,
 ) -> tuple[Array, Array]:
     """Return what `ideal_samples` does, each averaged over the ``interval`` (s) that ends at its time."""
     force = np.zeros((len(times), 3))
     rate = np.zeros((len(times), 3))
     for node, weight in zip(_MEAN_NODES, _MEAN_WEIGHTS, strict=True):
-        instant = ideal_samples(trajectory, frame, times - 0.5 * interval * (1.0 - node), mount)
+        instant = ideal_samples(trajectory, frame, times - 0.5 * interval * (1.0 - node), mount, gravity_removed)
         force += 0.5 * weight * instant[0]
         rate += 0.5 * weight * instant[1]
     return force, rate
@@ -114,25 +124,27 @@ def ideal_interval_means(
 
 @dataclass(frozen=True)
 class SensorErrors:
-    """Error model of one three-axis sensor, in the unit of its signal (rad/s or m/s2)."""
+    """Error model of one three-axis sensor, in the unit of its signal (rad/s or m/s2).
+
+    ``offset`` is added to the turn-on bias that is drawn with ``bias_std``.
+    """
 
     noise_density: float
     bias_random_walk: float
     bias_std: float
     scale_std: float = 0.0
     quantum: float = 0.0
+    offset: Vector = (0.0, 0.0, 0.0)
 
     def apply(self, ideal: Array, rate_hz: float, seed: np.random.SeedSequence) -> tuple[Array, Array]:
         """Return the measured signal and its true bias, both (n, 3), for the ``ideal`` one sampled at ``rate_hz``.
 
         Each kind of error has its own random stream, so that switching one off leaves the others as they are.
         """
-        bias_stream, walk_stream, noise_stream, scale_stream = (
-            np.random.Generator(np.random.PCG64(s)) for s in seed.spawn(4)
-        )
+        bias_stream, walk_stream, noise_stream, scale_stream = generators(seed, 4)
         bias = walk_stream.standard_normal(ideal.shape)
         bias *= self.bias_random_walk / math.sqrt(rate_hz)
-        bias[0] = bias_stream.standard_normal(3) * self.bias_std
+        bias[0] = bias_stream.standard_normal(3) * self.bias_std + np.array(self.offset)
         np.cumsum(bias, axis=0, out=bias)
         measured = noise_stream.standard_normal(ideal.shape)
         measured *= self.noise_density * math.sqrt(rate_hz)

@@ -8,13 +8,17 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from eskf_ros.bags import BagError, BagWriter
+from eskf_ros.simulate import spelled
+from eskf_ros.simulate.frames import STRINGS
 from eskf_ros.simulate.imu import GRADES
-from eskf_ros.simulate.messages import STRINGS, Topic, topics_of
-from eskf_ros.simulate.scenario import SCENARIOS, Recording, simulate
+from eskf_ros.simulate.messages import Topic, topics_of
+from eskf_ros.simulate.recording import AIDS, EPISODES
+from eskf_ros.simulate.scenario import SCENARIOS, Options, Recording, simulate
 
 _BLOCK_NANOSECONDS = 60_000_000_000
 
@@ -23,9 +27,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code: 0, 2 for the user's mistakes, 130 after Ctrl-C."""
     arguments = _parser().parse_args(argv)
     if arguments.list:
-        width = max(map(len, SCENARIOS))
-        for name, found in SCENARIOS.items():
-            print(f"{name:{width}}  {found.description}")
+        print(_list())
         return 0
     out: Path = arguments.out or Path(f"{arguments.scenario}.mcap")
     try:
@@ -33,14 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise ValueError(f"name a scenario: {', '.join(SCENARIOS)}")
         if not out.parent.is_dir():
             raise ValueError(f"{out}: there is no folder {out.parent}")
-        recording = simulate(
-            arguments.scenario,
-            arguments.seed,
-            grade=arguments.grade,
-            imu_rate=arguments.imu_rate,
-            gnss_rate=arguments.gnss_rate,
-            truth_rate=arguments.truth_rate,
-        )
+        recording = simulate(arguments.scenario, arguments.seed, **_options(arguments))
         topics = topics_of(recording)
         # A folder of its own for the file while it is incomplete: an interrupted run leaves an older one as it was.
         with tempfile.TemporaryDirectory(prefix=".eskf_simulate-", dir=out.parent) as folder:
@@ -67,15 +62,64 @@ def _parser() -> argparse.ArgumentParser:
         "The same scenario, seed and options give the same recording.",
     )
     parser.add_argument("scenario", nargs="?", metavar="SCENARIO", help=f"one of {', '.join(SCENARIOS)}")
-    parser.add_argument("--list", action="store_true", help="describe the scenarios and stop")
+    parser.add_argument("--list", action="store_true", help="describe scenarios, sensors and episodes and stop")
     parser.add_argument("--out", type=Path, metavar="FILE.mcap", help="the file to write (default: SCENARIO.mcap here)")
     parser.add_argument("--seed", type=_seed, default=0, metavar="N", help="seed of all random errors (default 0)")
     parser.add_argument("--grade", choices=GRADES, default="industrial", help="IMU error model (default industrial)")
     parser.add_argument("--imu-rate", type=float, default=200.0, metavar="HZ", help="default 200")
     parser.add_argument("--gnss-rate", type=float, default=5.0, metavar="HZ", help="default 5")
     parser.add_argument("--truth-rate", type=float, default=50.0, metavar="HZ", help="at most this, default 50")
+    parser.add_argument(
+        "--sensor",
+        action="append",
+        default=[],
+        metavar="NAME[:KEY=VALUE,...]",
+        help=f"record this sensor too (repeatable): {', '.join(AIDS)}; --list shows their keys",
+    )
+    parser.add_argument(
+        "--episode",
+        action="append",
+        default=[],
+        metavar="KIND:KEY=VALUE,...",
+        help=f"let this happen (repeatable): {', '.join(EPISODES)}; --list shows their keys",
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="OPTION=VALUE",
+        help="any option of the simulation (repeatable), such as lever_arm=0.8/-0.2/1.4; --list shows them",
+    )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     return parser
+
+
+def _options(arguments: argparse.Namespace) -> dict[str, Any]:
+    options: dict[str, Any] = {
+        "grade": arguments.grade,
+        "imu_rate": arguments.imu_rate,
+        "gnss_rate": arguments.gnss_rate,
+        "truth_rate": arguments.truth_rate,
+        "episodes": tuple(spelled.read(text, EPISODES)[1] for text in arguments.episode),
+    }
+    options.update(spelled.read(text, AIDS) for text in arguments.sensor)
+    options.update(spelled.read_value(text, Options) for text in arguments.set)
+    return options
+
+
+def _list() -> str:
+    width = max(map(len, SCENARIOS))
+    lines = [
+        "Scenarios:",
+        *(f"  {name:{width}}  {found.description}" for name, found in SCENARIOS.items()),
+        "Sensors, with --sensor:",
+        *(f"  {spelled.spelled(name, kind)}" for name, kind in AIDS.items()),
+        "Episodes, with --episode; START and LENGTH in seconds:",
+        *(f"  {spelled.spelled(name, kind)}" for name, kind in EPISODES.items()),
+        "All options, with --set:",
+        *(f"  {text}" for text in spelled.values(Options)),
+    ]
+    return "\n".join(lines)
 
 
 def _seed(text: str) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,17 +13,27 @@ from numpy.typing import NDArray
 
 from eskf_ros import rotation
 from eskf_ros.bags import message_dtype
-from eskf_ros.simulate.scenario import Recording
+from eskf_ros.simulate import aid_messages
+from eskf_ros.simulate.frames import Frame
+from eskf_ros.simulate.gnss import GnssMeasurements
+from eskf_ros.simulate.recording import Recording
 
 Array = NDArray[np.float64]
 
-STRINGS = ("imu_link", "gps", "earth", "base_link")
-"""The frames; messages hold indices into them."""
-_IMU_FRAME, _GNSS_FRAME, _EARTH_FRAME, _BASE_FRAME = range(4)
-
-_STATUS_FIX = 0
 _SERVICE_GPS = 1
-_COVARIANCE_DIAGONAL_KNOWN = 2
+
+_AIDS: dict[str, tuple[str, str, Callable[[Any, slice], NDArray[Any]]]] = {
+    "dual_antenna": ("gnss/heading", "sensor_msgs/msg/Imu", aid_messages.dual_antenna),
+    "wheel": ("wheel/odom", "nav_msgs/msg/Odometry", aid_messages.wheel),
+    "magnetometer": ("imu/mag", "sensor_msgs/msg/MagneticField", aid_messages.magnetometer),
+    "barometer": ("baro", "sensor_msgs/msg/FluidPressure", aid_messages.barometer),
+    "body_velocity": (
+        "body_velocity",
+        "geometry_msgs/msg/TwistWithCovarianceStamped",
+        aid_messages.body_velocity,
+    ),
+}
+"""Topic, type and conversion of the aids that have one topic each."""
 
 
 @dataclass(frozen=True)
@@ -36,24 +47,33 @@ class Topic:
 
 
 def topics_of(recording: Recording) -> list[Topic]:
-    """Return the topics ``imu/data``, ``gps/fix``, ``gps/vel`` and ``truth`` of a recording."""
+    """Return the topics ``imu/data``, ``gps/fix``, ``gps/vel`` and ``truth`` of a recording, then those of its aids."""
+    topics = [
+        Topic("imu/data", "sensor_msgs/msg/Imu", recording.imu_arrival, partial(_imu, recording)),
+        *_gnss("gps", Frame.GNSS, recording),
+        Topic("truth", "nav_msgs/msg/Odometry", recording.truth_stamp, partial(_truth, recording)),
+    ]
+    if recording.second_gnss:
+        topics += _gnss("gps2", Frame.SECOND_GNSS, recording.second_gnss)
+    for aid, (name, type_name, messages) in _AIDS.items():
+        measured = getattr(recording, aid)
+        if measured:
+            topics.append(Topic(name, type_name, measured.arrival, partial(messages, measured)))
+    return topics
+
+
+def _gnss(name: str, frame: Frame, gnss: GnssMeasurements) -> list[Topic]:
+    velocity_type = "geometry_msgs/msg/TwistWithCovarianceStamped"
     return [
-        Topic("imu/data", "sensor_msgs/msg/Imu", recording.imu_arrival, lambda part: _imu(recording, part)),
-        Topic("gps/fix", "sensor_msgs/msg/NavSatFix", recording.fix_arrival, lambda part: _fixes(recording, part)),
-        Topic(
-            "gps/vel",
-            "geometry_msgs/msg/TwistWithCovarianceStamped",
-            recording.velocity_arrival,
-            lambda part: _velocities(recording, part),
-        ),
-        Topic("truth", "nav_msgs/msg/Odometry", recording.truth_stamp, lambda part: _truth(recording, part)),
+        Topic(f"{name}/fix", "sensor_msgs/msg/NavSatFix", gnss.fix_arrival, partial(_fixes, gnss, frame)),
+        Topic(f"{name}/vel", velocity_type, gnss.velocity_arrival, partial(_velocities, gnss, frame)),
     ]
 
 
 def _imu(recording: Recording, part: slice) -> NDArray[Any]:
     messages = np.zeros(len(recording.imu_stamp[part]), message_dtype("sensor_msgs/msg/Imu"))
     messages["stamp"] = recording.imu_stamp[part]
-    messages["frame_id"] = _IMU_FRAME
+    messages["frame_id"] = Frame.IMU
     # REP-145: an orientation that is not measured is announced by a first covariance element of -1.
     messages["orientation"][:, 3] = 1.0
     messages["orientation_covariance"][:, 0] = -1.0
@@ -66,30 +86,30 @@ def _imu(recording: Recording, part: slice) -> NDArray[Any]:
     return messages
 
 
-def _fixes(recording: Recording, part: slice) -> NDArray[Any]:
-    messages = np.zeros(len(recording.fix_stamp[part]), message_dtype("sensor_msgs/msg/NavSatFix"))
-    messages["stamp"] = recording.fix_stamp[part]
-    messages["frame_id"] = _GNSS_FRAME
-    messages["status"] = _STATUS_FIX
+def _fixes(gnss: GnssMeasurements, frame: Frame, part: slice) -> NDArray[Any]:
+    messages = np.zeros(len(gnss.fix_stamp[part]), message_dtype("sensor_msgs/msg/NavSatFix"))
+    messages["stamp"] = gnss.fix_stamp[part]
+    messages["frame_id"] = frame
+    messages["status"] = gnss.fix_status[part]
     messages["service"] = _SERVICE_GPS
-    messages["latitude"] = recording.fix_latitude_deg[part]
-    messages["longitude"] = recording.fix_longitude_deg[part]
-    messages["altitude"] = recording.fix_altitude[part]
-    messages["position_covariance"] = recording.fix_covariance[part]
-    messages["position_covariance_type"] = _COVARIANCE_DIAGONAL_KNOWN
+    messages["latitude"] = gnss.fix_latitude_deg[part]
+    messages["longitude"] = gnss.fix_longitude_deg[part]
+    messages["altitude"] = gnss.fix_altitude[part]
+    messages["position_covariance"] = gnss.fix_covariance[part]
+    messages["position_covariance_type"] = gnss.fix_covariance_type[part]
     return messages
 
 
-def _velocities(recording: Recording, part: slice) -> NDArray[Any]:
-    count = len(recording.velocity_stamp[part])
+def _velocities(gnss: GnssMeasurements, frame: Frame, part: slice) -> NDArray[Any]:
+    count = len(gnss.velocity_stamp[part])
     messages = np.zeros(count, message_dtype("geometry_msgs/msg/TwistWithCovarianceStamped"))
-    messages["stamp"] = recording.velocity_stamp[part]
-    messages["frame_id"] = _GNSS_FRAME
-    messages["linear_velocity"] = recording.velocity_enu[part]
+    messages["stamp"] = gnss.velocity_stamp[part]
+    messages["frame_id"] = frame
+    messages["linear_velocity"] = gnss.velocity_enu[part]
     covariance = np.zeros((count, 6, 6))
-    covariance[:, :3, :3] = recording.velocity_covariance[part].reshape(-1, 3, 3)
-    # The receiver does not measure rotation.
-    covariance[:, 3, 3] = -1.0
+    covariance[:, :3, :3] = gnss.velocity_covariance[part].reshape(-1, 3, 3)
+    # The receiver does not measure rotation; one that leaves its covariances zero does not say so either.
+    covariance[:, 3, 3] = np.where(gnss.velocity_covariance[part].any(axis=1), -1.0, 0.0)
     messages["twist_covariance"] = covariance.reshape(-1, 36)
     return messages
 
@@ -97,8 +117,8 @@ def _velocities(recording: Recording, part: slice) -> NDArray[Any]:
 def _truth(recording: Recording, part: slice) -> NDArray[Any]:
     messages = np.zeros(len(recording.truth_stamp[part]), message_dtype("nav_msgs/msg/Odometry"))
     messages["stamp"] = recording.truth_stamp[part]
-    messages["frame_id"] = _EARTH_FRAME
-    messages["child_frame_id"] = _BASE_FRAME
+    messages["frame_id"] = Frame.EARTH
+    messages["child_frame_id"] = Frame.BASE
     messages["position"] = recording.frame.to_ecef(recording.truth_position_map[part])
     # East-North-Up is reached from ECEF axes by a turn about z and one about the new x.
     latitude, longitude = (math.radians(angle) for angle in recording.datum[:2])

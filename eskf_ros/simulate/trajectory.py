@@ -14,11 +14,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PPoly
+
+from eskf_ros.simulate.motion import Motion, checked_times
 
 Array = NDArray[np.float64]
 
@@ -65,61 +66,6 @@ class Turn:
 Instruction = Hold | SpeedTo | Turn
 
 
-@dataclass(frozen=True)
-class Motion:
-    """Truth of base_link at n times. Lengths in m, angles in rad, time in s.
-
-    ``position_map``, ``velocity_map``, ``acceleration_map`` (n, 3): relative to ``map``, in its axes.
-    ``attitude_body_to_map`` (n, 4): quaternion w x y z.
-    ``angular_rate_body``, ``angular_acceleration_body`` (n, 3): of the body relative to ``map``, in body axes.
-    """
-
-    position_map: Array
-    velocity_map: Array
-    acceleration_map: Array
-    attitude_body_to_map: Array
-    angular_rate_body: Array
-    angular_acceleration_body: Array
-
-    @cached_property
-    def rotation_body_to_map(self) -> Array:
-        """The attitudes as rotation matrices (n, 3, 3)."""
-        w, x, y, z = self.attitude_body_to_map.T
-        rows = (
-            (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
-            (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
-            (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
-        )
-        return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-    def velocity_of(self, lever_arm_body: ArrayLike) -> Array:
-        """Return the velocity in map (n, 3) of a point fixed in the body at ``lever_arm_body`` (3,)."""
-        arm = np.asarray(lever_arm_body, dtype=np.float64)
-        return self.velocity_map + _rotate(self.rotation_body_to_map, cross(self.angular_rate_body, arm))
-
-    def position_of(self, lever_arm_body: ArrayLike) -> Array:
-        """Return the position in map (n, 3) of a point fixed in the body at ``lever_arm_body`` (3,)."""
-        return self.position_map + self.rotation_body_to_map @ np.asarray(lever_arm_body, dtype=np.float64)
-
-    def acceleration_of(self, lever_arm_body: ArrayLike) -> Array:
-        """Return the acceleration in map (n, 3) of a point fixed in the body at ``lever_arm_body`` (3,)."""
-        arm = np.asarray(lever_arm_body, dtype=np.float64)
-        rate = self.angular_rate_body
-        in_body = cross(self.angular_acceleration_body, arm) + cross(rate, cross(rate, arm))
-        return self.acceleration_map + _rotate(self.rotation_body_to_map, in_body)
-
-
-def cross(a: Array, b: Array) -> Array:
-    """Return the cross products of 3-vectors in the last axis; several times quicker than numpy's for few vectors."""
-    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
-    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
-
-
-def _rotate(rotation: Array, vectors: Array) -> Array:
-    return np.einsum("nij,nj->ni", rotation, vectors)
-
-
 class DriveTrajectory:
     """A car following driving instructions, starting at the origin of ``map``."""
 
@@ -163,9 +109,7 @@ class DriveTrajectory:
 
     def motion(self, times: ArrayLike) -> Motion:
         """Return the truth at ``times`` (n,) in seconds from the start; ValueError outside of the drive."""
-        t = np.atleast_1d(np.asarray(times, dtype=np.float64))
-        if t.size and (t.min() < 0.0 or t.max() > self.duration):
-            raise ValueError(f"times must lie within the drive, 0 to {self.duration:.3f} s")
+        t = checked_times(times, self.duration)
         distance, speed, yaw, acceleration, yaw_rate, jerk, yaw_acceleration, snap, yaw_jerk = self._profile(t).T
         slope, slope_gradient, slope_curvature = self._slope(distance)
         slope_rate = slope_gradient * speed
