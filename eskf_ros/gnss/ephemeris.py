@@ -92,6 +92,7 @@ EPHEMERIS = np.dtype(
         ("toe", "f8"),
         ("toc", "f8"),
         ("sent", "f8"),
+        ("max_lead", "f8"),
         ("max_age", "f8"),
         ("accuracy", "f8"),
         ("toe_own", "f8"),
@@ -107,12 +108,12 @@ EPHEMERIS = np.dtype(
 
 ``issue``: IODE, IODnav or AODE; for GLONASS the number of the quarter of an hour in the Moscow day. ``toe``, ``toc``,
 ``sent``: seconds of GPS week of ephemeris, clock and transmission (NaN unknown), with their weeks. ``toe_own``:
-seconds of week of ``toe`` in the constellation's own time, as the longitude of the node needs it. ``max_age``: seconds
-before and after ``toe`` for which the orbit is good. ``accuracy``: URA or SISA, m (NaN unknown). ``af0``, ``af1``,
-``af2``: clock polynomial from ``toc`` (s, s/s, s/s2), for GLONASS -TauN and GammaN. ``position``, ``velocity``,
-``acceleration``: GLONASS state at ``toe`` in PZ-90.11 (m, m/s, m/s2, the acceleration by Sun and Moon). ``channel``:
-GLONASS frequency channel. ``group_delay``: seconds by which a signal leaves earlier than the clock polynomial says,
-NaN where the message does not tell. ``unhealthy``: bit per slot.
+seconds of week of ``toe`` in the constellation's own time, as the longitude of the node needs it. ``max_lead``,
+``max_age``: seconds before and after ``toe`` for which the orbit is good. ``accuracy``: URA or SISA, m (NaN unknown).
+``af0``, ``af1``, ``af2``: clock polynomial from ``toc`` (s, s/s, s/s2), for GLONASS -TauN and GammaN. ``position``,
+``velocity``, ``acceleration``: GLONASS state at ``toe`` in PZ-90.11 (m, m/s, m/s2, the acceleration by Sun and Moon).
+``channel``: GLONASS frequency channel. ``group_delay``: seconds by which a signal leaves later than the clock
+polynomial says, NaN where the message does not tell. ``unhealthy``: bit per slot.
 """
 
 SATELLITE_KEYS = 256
@@ -120,16 +121,16 @@ SATELLITE_KEYS = 256
 
 ALL_SLOTS = (1 << SLOT_COUNT) - 1
 
-# How long before and after its reference time an ephemeris is used (s). GPS: half the usual fit interval (IS-GPS-200N,
-# section 20.3.3.4.3.1). Galileo: a new one every 10 min, none is older than 4 h (OS-SIS-ICD 2.1).
-# BeiDou: hourly, kept through the hours in which the control segment sees no MEO satellite. GLONASS: integration over
-# 15 min is what the accuracy holds for (ICD 5.1, A.3.1.2), half an hour bridges one missed message.
-MAX_AGE = {
-    Gnss.GPS: 7200.0,
-    Gnss.QZSS: 7200.0,
-    Gnss.GALILEO: 14400.0,
-    Gnss.BEIDOU: 21600.0,
-    Gnss.GLONASS: 1800.0,
+# How long an ephemeris is used (s): before its reference time and after. GPS: half the usual fit interval to both sides
+# (IS-GPS-200N, section 20.3.3.4.3.1); Galileo and BeiDou are fitted to the hours that follow. At the limits the orbits
+# of a day were 2 to 9 m (95 %) off precise orbits and off the ephemerides in force; an hour later Galileo's are 10 m,
+# GLONASS's 100 m off.
+_LEAD_AND_AGE = {
+    Gnss.GPS: (7200.0, 7200.0),
+    Gnss.QZSS: (5400.0, 5400.0),
+    Gnss.GALILEO: (1800.0, 12600.0),
+    Gnss.BEIDOU: (5400.0, 10800.0),
+    Gnss.GLONASS: (1800.0, 1800.0),
 }
 
 _NOT_BROADCAST = 9.9e8
@@ -163,9 +164,9 @@ def kepler_record(gnss: Gnss, sv_id: int, message: Message, toc: Instant, fields
     record["toe_own"] = toe_own
     record["toe_week"], record["toe"] = _shifted(toe_week, toe_own, offset)
     record["sent_week"], record["sent"] = _shifted(sent_week, sent, offset)
-    record["max_age"] = MAX_AGE[gnss]
+    record["max_lead"], record["max_age"] = _LEAD_AND_AGE[gnss]
     if gnss == Gnss.GPS and 4.0 < fields.get("fit", math.nan) <= 26.0:
-        record["max_age"] = 1800.0 * fields["fit"]
+        record["max_lead"] = record["max_age"] = 1800.0 * fields["fit"]
     record["accuracy"] = fields.get("accuracy", math.nan)
     for name in CLOCK_FIELDS + KEPLER_FIELDS:
         record[name] = fields.get(name, 0.0 if name in ("a_rate", "delta_n_rate", "af2") else math.nan)
@@ -194,7 +195,7 @@ def glonass_record(sv_id: int, tb_utc: Instant, leap: int, fields: Fields) -> np
         sent += SECONDS_PER_DAY * round((tb_utc[1] - sent) / SECONDS_PER_DAY)
     sent_week = week_near(sent, tb_utc) if math.isfinite(sent) else 0
     record["sent_week"], record["sent"] = _shifted(sent_week, sent, leap)
-    record["max_age"] = MAX_AGE[Gnss.GLONASS]
+    record["max_lead"], record["max_age"] = _LEAD_AND_AGE[Gnss.GLONASS]
     record["accuracy"] = fields.get("accuracy", math.nan)
     record["af0"], record["af1"] = fields.get("af0", math.nan), fields.get("af1", math.nan)
     record["channel"] = _integer(fields.get("channel", math.nan), 0)
@@ -215,7 +216,7 @@ def group_delays(gnss: Gnss, message: Message, fields: Fields) -> NDArray[np.flo
       20.3.3.3.3.2 (TGD) and 30.3.3.3.1.1 (ISC, CNAV), IS-GPS-705 (L5), IS-GPS-800 (L1C); IS-QZSS-PNT. LNAV takes L1
       C/A for L1 P(Y) and L2C for L2 P(Y): a few decimetres.
     - Galileo: I/NAV to E1 and E5b, F/NAV to E1 and E5a (OS-SIS-ICD 2.1, section 5.1.5). E5a with the clock of I/NAV
-      follows from both: E1 leaves BGD(E1,E5b) before the one and BGD(E1,E5a) before the other clock.
+      follows from both: E1 leaves BGD(E1,E5b) after the one and BGD(E1,E5a) after the other clock.
     - BeiDou: B3I (BDS-SIS-ICD-B1I 3.0, B1C 1.0, B2a 1.0, B2b 1.0).
     - GLONASS: L1; L2 is later by delta tau (ICD 5.1, section 4.4).
     """

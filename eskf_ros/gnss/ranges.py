@@ -236,10 +236,10 @@ def state_is_finite(observed):
 def choose(records, first, gnss_id, sv_id, slot, week, seconds, issue):
     """Return the index of the ephemeris for a signal at an instant of GPS time, and a `Status`; index -1 for none.
 
-    Of the messages that are young enough (``max_age``) and give the group delay of ``slot``: the one first in
-    `ephemeris.Message`, with the reference time closest to the instant; with ``issue`` (not `NO_ISSUE`) only that
-    issue. The satellite is unhealthy when this ephemeris says so, or the one sent last before the instant: an old good
-    one is no way around a new warning.
+    Of the messages in their time (``max_lead``, ``max_age``) that give the group delay of ``slot``: the one first in
+    `ephemeris.Message`, and of its issues the one whose reference time is closest, as a share of the time allowed; with
+    ``issue`` (not `NO_ISSUE`) only that issue. The satellite is unhealthy when this ephemeris says so, or the one sent
+    last before the instant: an old good one is no way around a new warning.
     """
     if not (0 <= gnss_id < GNSS_COUNT and 0 <= sv_id < SATELLITE_KEYS):
         return -1, _NO_EPHEMERIS
@@ -251,8 +251,9 @@ def choose(records, first, gnss_id, sv_id, slot, week, seconds, issue):
         ephemeris = records[k]
         if issue != NO_ISSUE and ephemeris["issue"] != issue:
             continue
-        age = abs(elapsed(week, seconds, ephemeris["toe_week"], ephemeris["toe"]))
-        if not age <= ephemeris["max_age"]:
+        since_toe = elapsed(week, seconds, ephemeris["toe_week"], ephemeris["toe"])
+        age = since_toe / ephemeris["max_age"] if since_toe > 0.0 else -since_toe / ephemeris["max_lead"]
+        if not age <= 1.0:
             reason = max(reason, _STALE)
             continue
         if slot < 0 or math.isnan(ephemeris["group_delay"][slot]):
