@@ -88,7 +88,8 @@ EPHEMERIS = np.dtype(
         ("toc_week", "i4"),
         ("sent_week", "i4"),
         ("channel", "i4"),
-        ("unhealthy", "i4"),
+        # Eight bytes leave no gap, whose content would be anything: records are told apart by their bytes.
+        ("unhealthy", "i8"),
         ("toe", "f8"),
         ("toc", "f8"),
         ("sent", "f8"),
@@ -155,12 +156,12 @@ def kepler_record(gnss: Gnss, sv_id: int, message: Message, toc: Instant, fields
     record = np.zeros(1, EPHEMERIS)[0]
     offset = BEIDOU_OFFSET if gnss == Gnss.BEIDOU else 0.0
     toe_own = fields.get("toe", toc[1])
-    toe_week = week_near(toe_own, toc) if math.isfinite(toe_own) else 0
+    toe_week = week_near(toe_own, toc) if math.isfinite(toe_own + toc[1]) else 0
     sent = fields.get("sent", math.nan)
     sent_week = week_near(sent, (toe_week, toe_own)) if math.isfinite(sent + toe_own) else 0
     record["gnss_id"], record["sv_id"], record["message"] = gnss, sv_id, message
     record["issue"] = _integer(fields.get("issue", math.nan), NO_ISSUE)
-    record["toc_week"], record["toc"] = normalized(toc[0], toc[1] + offset)
+    record["toc_week"], record["toc"] = _shifted(toc[0], toc[1], offset)
     record["toe_own"] = toe_own
     record["toe_week"], record["toe"] = _shifted(toe_week, toe_own, offset)
     record["sent_week"], record["sent"] = _shifted(sent_week, sent, offset)
