@@ -165,6 +165,8 @@ def _blocks(header: Header, lines: list[str]) -> Iterator[tuple[int, str, list[s
 
 def _read_block(header: Header, index: int, kind: str, block: list[str], leap: int | None, reading: _Reading) -> None:
     """Read one record. Raises ValueError when it cannot be read."""
+    if not block:
+        raise ValueError("nothing follows its type")
     if header.version < 3.0:
         letter = "R" if header.kind == "G" else "G"
         satellite, date, clock = block[0][:2], block[0][2:22], 22

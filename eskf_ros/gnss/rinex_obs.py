@@ -295,7 +295,11 @@ def _observations(
                 scale = scales.get((letter, types[column]), scales.get((letter, ""), 1.0))
                 part[name] = _numbers(cells[:, column], rows, complaints) / scale
         part["pseudorange"][part["pseudorange"] == 0.0] = math.nan
-        parts.append(part[np.isfinite(part["pseudorange"]) | np.isfinite(part["doppler"])])
+        measured = np.isfinite(part["pseudorange"])
+        if version >= 3.0:
+            # In version 2 the Doppler is that of the band, and no sign of a signal.
+            measured |= np.isfinite(part["doppler"])
+        parts.append(part[measured])
     return np.concatenate(parts) if parts else np.zeros(0, OBSERVATION)
 
 
