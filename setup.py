@@ -48,8 +48,11 @@ setup(
             "hypothesis",
             "mypy",
             "pymap3d",
+            # Independent GNSS libraries, wheels for Linux on x86-64; without them these comparisons are skipped.
+            "pyrtklib5; sys_platform == 'linux' and platform_machine == 'x86_64' and python_version < '3.13'",
             "pytest",
             "ruff",
+            "sidereon; sys_platform == 'linux' and platform_machine == 'x86_64'",
         ],
     },
     entry_points={

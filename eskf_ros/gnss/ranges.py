@@ -1,0 +1,274 @@
+"""Observed ranges of one epoch: what a receiver measured, and the satellite each measurement belongs to.
+
+A RANGE is one point of the topic `gnss/ranges`, or one signal of a RINEX file. `locate` completes it with the state of
+the satellite from the ephemerides; `status` says why a range cannot be used.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eskf_ros.compiled import njit
+from eskf_ros.gnss.ephemeris import NO_ISSUE, SATELLITE_KEYS, Ephemerides
+from eskf_ros.gnss.orbits import satellite_state, transmission
+from eskf_ros.gnss.signals import (
+    GNSS_COUNT,
+    L1,
+    SIGNAL_CARRIER_HZ,
+    SIGNAL_GNSS,
+    SIGNAL_SLOT,
+    SIGNALS,
+    UNKNOWN_SIGNAL,
+    Gnss,
+    carrier_hz,
+)
+from eskf_ros.gnss.time import SECONDS_PER_WEEK, elapsed
+
+
+class Status(IntEnum):
+    """Why a range is not used (a closed list)."""
+
+    USABLE = 0
+    UNKNOWN_SIGNAL = 1
+    BAD_VALUE = 2
+    NO_EPHEMERIS = 3
+    STALE = 4
+    UNHEALTHY = 5
+    NO_GROUP_DELAY = 6
+    BAD_EPHEMERIS = 7
+    NOT_LOCATED = 8
+    LOW_ELEVATION = 9
+    LOW_CN0 = 10
+    OUTLIER = 11
+
+
+CODE_VALID = 1
+DOPPLER_VALID = 2
+SATELLITE_KNOWN = 4
+GROUP_DELAY_APPLIED = 8
+IONOSPHERE_APPLIED = 16
+TROPOSPHERE_APPLIED = 32
+ALREADY_TURNED = 64
+
+RANGE = np.dtype(
+    [
+        ("gnss_id", "i4"),
+        ("sv_id", "i4"),
+        ("signal", "i4"),
+        ("status", "i4"),
+        ("flags", "i4"),
+        ("issue", "i4"),
+        ("carrier_hz", "f8"),
+        ("pseudorange", "f8"),
+        ("pseudorange_std", "f8"),
+        ("doppler", "f8"),
+        ("doppler_std", "f8"),
+        ("cn0", "f8"),
+        ("noise_factor", "f8"),
+        ("satellite", "f8", (3,)),
+        ("satellite_velocity", "f8", (3,)),
+        ("satellite_clock", "f8"),
+        ("satellite_clock_drift", "f8"),
+    ],
+    align=True,
+)
+"""One measured signal.
+
+``signal``: index into `signals.SIGNALS`. ``flags``: the bits above, as in the topic. ``issue``: of the ephemeris used.
+``pseudorange`` m, ``doppler`` Hz (positive when approaching), their standard deviations (NaN: by model), ``cn0`` dB-Hz
+(NaN unknown). ``noise_factor``: what a combination multiplies the receiver's noise and multipath with, 1 for a plain
+range. ``satellite``, ``satellite_velocity``: ECEF at transmission (m, m/s), of reception with `ALREADY_TURNED`.
+``satellite_clock`` (s): with relativity, and less the group delay of this signal; ``satellite_clock_drift`` s/s.
+"""
+
+# Farther than any satellite from any place on or above the Earth; nearer than a receiver clock is ever off.
+SHORTEST_PSEUDORANGE = 1e6
+LONGEST_PSEUDORANGE = 1e8
+LARGEST_DOPPLER = 1e5
+
+_UNKNOWN_SIGNAL = int(Status.UNKNOWN_SIGNAL)
+_BAD_VALUE = int(Status.BAD_VALUE)
+_NO_EPHEMERIS = int(Status.NO_EPHEMERIS)
+_STALE = int(Status.STALE)
+_UNHEALTHY = int(Status.UNHEALTHY)
+_NO_GROUP_DELAY = int(Status.NO_GROUP_DELAY)
+_BAD_EPHEMERIS = int(Status.BAD_EPHEMERIS)
+_USABLE = int(Status.USABLE)
+_GLONASS = int(Gnss.GLONASS)
+_SIGNAL_COUNT = len(SIGNALS)
+
+
+def allocate_ranges(count: int) -> NDArray[np.void]:
+    """Return ``count`` ranges (RANGE) in which nothing is known yet."""
+    ranges = np.zeros(count, RANGE)
+    for name in RANGE.names or ():
+        if RANGE[name].base.kind == "f":
+            ranges[name] = math.nan
+    ranges["signal"] = UNKNOWN_SIGNAL
+    ranges["status"] = Status.NOT_LOCATED
+    ranges["issue"] = NO_ISSUE
+    ranges["noise_factor"] = 1.0
+    return ranges
+
+
+def locate(ranges: NDArray[np.void], week: int, seconds: float, ephemerides: Ephemerides) -> None:
+    """Complete the ranges (RANGE, in place) of one epoch with satellite state, carrier and status.
+
+    ``week``, ``seconds``: time tag of the epoch by the receiver's clock in GPS time. Ranges that bring their satellite
+    (`SATELLITE_KNOWN`) keep it.
+    """
+    locate_all(ranges, week, seconds, ephemerides.records, ephemerides.first)
+
+
+def status_counts(ranges: NDArray[np.void]) -> Counter[Status]:
+    """Return how many ranges have which status."""
+    values, counts = np.unique(ranges["status"], return_counts=True)
+    return Counter({Status(value): int(count) for value, count in zip(values, counts)})
+
+
+def one_per_satellite(ranges: NDArray[np.void]) -> NDArray[np.void]:
+    """Return of each satellite the usable range whose signal comes first in `signals.SIGNALS`: L1 where there is one.
+
+    Several signals of a satellite share its orbit, clock and ionosphere errors; a filter that takes all of them as
+    independent believes too much.
+    """
+    usable = ranges[(ranges["status"] == Status.USABLE) & (ranges["flags"] & CODE_VALID != 0)]
+    usable = usable[np.lexsort([usable["signal"], usable["sv_id"], usable["gnss_id"]])]
+    satellite = SATELLITE_KEYS * usable["gnss_id"] + usable["sv_id"]
+    return usable[np.concatenate([[True], satellite[1:] != satellite[:-1]]) if len(usable) else []]
+
+
+def ionosphere_free(ranges: NDArray[np.void]) -> NDArray[np.void]:
+    """Return one range per satellite with usable code on two frequencies, combined so that the ionosphere cancels.
+
+    Of each satellite the first signal in `signals.SIGNALS` and the one whose frequency is farthest from it. First-order
+    ionosphere only (a few centimetres remain); noise and multipath grow by ``noise_factor``, three for L1 and L2
+    (Kaplan and Hegarty, Understanding GPS, 3rd ed., section 10.2.4.1). Doppler and C/N0 are those of the first signal:
+    the C/N0 of L2 P(Y) tracked without its code says little about the code noise.
+    """
+    usable = ranges[(ranges["status"] == Status.USABLE) & (ranges["flags"] & CODE_VALID != 0)]
+    usable = usable[np.lexsort([usable["signal"], usable["sv_id"], usable["gnss_id"]])]
+    satellite = SATELLITE_KEYS * usable["gnss_id"] + usable["sv_id"]
+    combined = []
+    for key in np.unique(satellite):
+        signals = usable[satellite == key]
+        first = signals[0].copy()
+        second = signals[np.argmax(np.abs(signals["carrier_hz"] - first["carrier_hz"]))]
+        if abs(second["carrier_hz"] - first["carrier_hz"]) < 0.1 * L1:
+            continue
+        f1, f2 = first["carrier_hz"] ** 2, second["carrier_hz"] ** 2
+        near, far = f1 / (f1 - f2), f2 / (f1 - f2)
+        first["pseudorange"] = near * first["pseudorange"] - far * second["pseudorange"]
+        first["satellite_clock"] = near * first["satellite_clock"] - far * second["satellite_clock"]
+        first["pseudorange_std"] = math.hypot(near * first["pseudorange_std"], far * second["pseudorange_std"])
+        first["noise_factor"] = math.hypot(near * first["noise_factor"], far * second["noise_factor"])
+        first["flags"] |= IONOSPHERE_APPLIED
+        combined.append(first)
+    return np.array(combined, RANGE)
+
+
+@njit
+def locate_all(ranges, week, seconds, records, first):
+    """`locate` for the arrays of an `Ephemerides`."""
+    for k in range(len(ranges)):
+        locate_one(ranges[k], week, seconds, records, first)
+
+
+@njit
+def locate_one(observed, week, seconds, records, first):
+    """Complete one range in place."""
+    gnss, sv_id, signal = observed["gnss_id"], observed["sv_id"], observed["signal"]
+    known_signal = 0 <= signal < _SIGNAL_COUNT and SIGNAL_GNSS[signal] == gnss
+    pseudorange = observed["pseudorange"]
+    if not (SHORTEST_PSEUDORANGE < pseudorange < LONGEST_PSEUDORANGE):
+        observed["flags"] &= ~CODE_VALID
+    if not (abs(observed["doppler"]) < LARGEST_DOPPLER):
+        observed["flags"] &= ~DOPPLER_VALID
+    if observed["flags"] & SATELLITE_KNOWN:
+        if math.isnan(observed["carrier_hz"]) and known_signal:
+            observed["carrier_hz"] = SIGNAL_CARRIER_HZ[signal]
+        observed["status"] = _USABLE if state_is_finite(observed) else _BAD_VALUE
+        return
+    if not known_signal:
+        observed["status"] = _UNKNOWN_SIGNAL
+        return
+    if not observed["flags"] & CODE_VALID or not 0.0 <= seconds < SECONDS_PER_WEEK:
+        observed["status"] = _BAD_VALUE
+        return
+    slot = SIGNAL_SLOT[signal]
+    chosen, reason = choose(records, first, gnss, sv_id, slot, week, seconds, NO_ISSUE)
+    if chosen < 0:
+        observed["status"] = reason
+        return
+    ephemeris = records[chosen]
+    instant = transmission(ephemeris, week, seconds, pseudorange)
+    position, velocity, clock, drift = satellite_state(ephemeris, week, instant)
+    for axis in range(3):
+        observed["satellite"][axis] = position[axis]
+        observed["satellite_velocity"][axis] = velocity[axis]
+    observed["satellite_clock"] = clock - ephemeris["group_delay"][slot]
+    observed["satellite_clock_drift"] = drift
+    observed["issue"] = ephemeris["issue"]
+    if gnss == _GLONASS or math.isnan(observed["carrier_hz"]):
+        observed["carrier_hz"] = carrier_hz(signal, ephemeris["channel"])
+    if not state_is_finite(observed):
+        observed["status"] = _BAD_EPHEMERIS
+        return
+    observed["flags"] |= SATELLITE_KNOWN | GROUP_DELAY_APPLIED
+    observed["status"] = _USABLE
+
+
+@njit
+def state_is_finite(observed):
+    """True when position, velocity and clock of the satellite are numbers."""
+    total = observed["satellite_clock"] + observed["satellite_clock_drift"]
+    for axis in range(3):
+        total += observed["satellite"][axis] + observed["satellite_velocity"][axis]
+    return math.isfinite(total)
+
+
+@njit
+def choose(records, first, gnss_id, sv_id, slot, week, seconds, issue):
+    """Return the index of the ephemeris for a signal at an instant of GPS time, and a `Status`; index -1 for none.
+
+    Of the messages in their time (``max_lead``, ``max_age``) that give the group delay of ``slot``: the one first in
+    `ephemeris.Message`, and of its issues the one whose reference time is closest, as a share of the time allowed; with
+    ``issue`` (not `NO_ISSUE`) only that issue. The satellite is unhealthy when this ephemeris says so, or the one sent
+    last before the instant: an old good one is no way around a new warning.
+    """
+    if not (0 <= gnss_id < GNSS_COUNT and 0 <= sv_id < SATELLITE_KEYS):
+        return -1, _NO_EPHEMERIS
+    key = SATELLITE_KEYS * gnss_id + sv_id
+    chosen, message, closest = -1, 0, math.inf
+    newest, warned = -math.inf, False
+    reason = _NO_EPHEMERIS
+    for k in range(first[key], first[key + 1]):
+        ephemeris = records[k]
+        if issue != NO_ISSUE and ephemeris["issue"] != issue:
+            continue
+        since_toe = elapsed(week, seconds, ephemeris["toe_week"], ephemeris["toe"])
+        age = since_toe / ephemeris["max_age"] if since_toe > 0.0 else -since_toe / ephemeris["max_lead"]
+        if not age <= 1.0:
+            reason = max(reason, _STALE)
+            continue
+        if slot < 0 or math.isnan(ephemeris["group_delay"][slot]):
+            reason = max(reason, _NO_GROUP_DELAY)
+            continue
+        if chosen >= 0 and ephemeris["message"] > message:
+            break
+        since_sent = elapsed(ephemeris["sent_week"], ephemeris["sent"], week, seconds)
+        if newest < since_sent <= 0.0:
+            newest = since_sent
+            warned = (ephemeris["unhealthy"] >> slot) & 1 != 0
+        if age <= closest:
+            chosen, message, closest = k, ephemeris["message"], age
+    if chosen < 0:
+        return -1, reason
+    if warned or (records[chosen]["unhealthy"] >> slot) & 1:
+        return -1, _UNHEALTHY
+    return chosen, _USABLE
