@@ -106,7 +106,7 @@ def transform(parent: str, child: str, position: Any, rotation: Rotation) -> Any
 def test_a_sensor_is_found_along_the_tree(links):
     """footprint -> base_link, and footprint -> mast -> imu: up to the common ancestor and down again."""
     (p, a), (q, b), (r, c) = ((np.array(position), Rotation.from_euler("ZYX", turns)) for position, turns in links)
-    extrinsics = Extrinsics("base_link", set(), True)
+    extrinsics = Extrinsics(Parameters())
     extrinsics.note_transform(transform("footprint", "base_link", p, a))
     extrinsics.note_transform(transform("footprint", "mast", q, b))
     extrinsics.note_frame(IMU, "imu")
@@ -124,9 +124,8 @@ def test_a_sensor_is_found_along_the_tree(links):
 
 @needs_ros
 def test_what_a_parameter_gives_is_not_looked_up():
-    given_names = {"gnss.lever_arm"}
-    extrinsics = Extrinsics("base_link", given_names, True)
     parameters = from_mapping({"gnss.lever_arm": [1.0, 0.0, 0.0]})
+    extrinsics = Extrinsics(parameters)
     extrinsics.note_frame(ANTENNA, "gps")
     extrinsics.note_frame(IMU, "unknown")
     extrinsics.note_frame(IMU, "base_link")
@@ -135,14 +134,14 @@ def test_what_a_parameter_gives_is_not_looked_up():
     assert extrinsics.completed(parameters).gnss.lever_arm == (1.0, 0.0, 0.0)
     assert extrinsics.source_of(ANTENNA) == "parameters"
     assert extrinsics.source_of(IMU) == "/tf_static"
-    unused = Extrinsics("base_link", set(), False)
+    unused = Extrinsics(from_mapping({"frames.extrinsics": "parameters"}))
     unused.note_frame(IMU, "base_link")
     assert unused.find() == []
 
 
 @needs_ros
 def test_a_ring_of_transforms_and_broken_ones_end_the_search():
-    extrinsics = Extrinsics("base_link", set(), True)
+    extrinsics = Extrinsics(Parameters())
     extrinsics.note_transform(transform("a", "b", (1.0, 0.0, 0.0), Rotation.identity()))
     extrinsics.note_transform(transform("b", "a", (1.0, 0.0, 0.0), Rotation.identity()))
     broken = transform("base_link", "b", (math.nan, 0.0, 0.0), Rotation.identity())

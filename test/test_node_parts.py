@@ -758,6 +758,18 @@ def test_an_error_in_a_callback_comes_out_and_the_node_is_still_closed(
 
 
 @needs_ros
+def test_a_signal_while_the_node_is_made_ends_at_once(ros: Ros, tmp_path: Path) -> None:
+    """The first start compiles for up to a minute; launch kills what has not ended after some seconds."""
+    script = tmp_path / "slow.py"
+    slow = 'super().__init__("echo")\n        print(1, flush=True)\n        __import__("time").sleep(60)'
+    script.write_text(NODE.replace('super().__init__("echo")', slow))
+    process = ros.spawn([script])
+    ros.until(lambda: "1" in process.output, what="the node to be under way")
+    assert process.stop(signal.SIGTERM, timeout=5.0) == 0
+    assert process.output == "1\n"
+
+
+@needs_ros
 def test_a_signal_before_the_node_exists_ends_cleanly(ros: Ros, tmp_path: Path) -> None:
     script = tmp_path / "early.py"
     script.write_text("print('up', flush=True)\n" + NODE.replace("stop = StopFlag()", "stop = StopFlag()\nprint(1)"))

@@ -26,11 +26,6 @@ def declare(node: Node, source: str = "") -> Parameters:
     return parameters
 
 
-def given_names(node: Node) -> set[str]:
-    """Names of the parameters that a file or the command line gives."""
-    return set(_overrides(node))
-
-
 def unused_overrides(node: Node) -> list[str]:
     """Names that were given but belong to nothing on this node, such as `qos_overrides.` of a topic it has not.
 

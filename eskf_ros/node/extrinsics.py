@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Set
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from eskf_ros.parameters import Parameters
+from eskf_ros.parameters import Parameters, to_mapping
 
 Pose = tuple[np.ndarray, Rotation]
 """Position (3,) m and orientation of a frame in another."""
@@ -17,7 +16,7 @@ Pose = tuple[np.ndarray, Rotation]
 IMU = "imu"
 ANTENNA = "GNSS antenna"
 PARAMETERS = {IMU: ("imu.mount_position", "imu.mount_rpy_deg"), ANTENNA: ("gnss.lever_arm",)}
-"""What tells the place of each sensor; given there it is not looked up."""
+"""What tells the place of each sensor."""
 
 
 class Extrinsics:
@@ -26,10 +25,12 @@ class Extrinsics:
     Reading is a matter of the first messages: afterwards nothing changes, and nothing is looked up any more.
     """
 
-    def __init__(self, base_link: str, given: Set[str], use_tf: bool) -> None:
-        """`given`: names of the parameters that somebody set."""
-        self._base_link = base_link
-        self._wanted = {s for s, names in PARAMETERS.items() if use_tf and not given & set(names)}
+    def __init__(self, parameters: Parameters) -> None:
+        """`parameters` as somebody gave them: what is not zero there is not looked up."""
+        self._base_link = parameters.frames.base_link
+        values = to_mapping(parameters)
+        use_tf = parameters.frames.extrinsics == "auto"
+        self._wanted = {s for s, names in PARAMETERS.items() if use_tf and not any(any(values[n]) for n in names)}
         self._parents: dict[str, tuple[str, Pose]] = {}
         self._frames: dict[str, list[str]] = {}
         self._found: dict[str, Pose] = {}

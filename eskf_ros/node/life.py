@@ -14,8 +14,14 @@ LONGEST_WAIT = 0.1
 """The loop looks at the stop flag at least this often (s)."""
 
 
+class Stopped(BaseException):
+    """A signal came while the node was being made; like KeyboardInterrupt no error, so nobody takes it for one."""
+
+
 class StopFlag:
     """Becomes set by SIGINT or SIGTERM, and nothing else happens: the loop ends where it is safe to end.
+
+    Only while the node is being made, which may take a minute of compiling, `Stopped` is raised.
 
     The handlers of rclpy shut the context down under the running callback instead, which then fails with a traceback.
     A second signal (`ros2 launch` sends SIGINT to the group and to the process) changes nothing.
@@ -25,11 +31,15 @@ class StopFlag:
 
     def __init__(self) -> None:
         self.set = False
+        self.raises = False
         for number in self.SIGNALS:
             signal.signal(number, self._stop)
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
         self.set = True
+        if self.raises:
+            self.raises = False
+            raise Stopped
 
     def ignore_from_now(self) -> None:
         """Signals that arrive while the interpreter itself ends would still spoil the exit code."""
@@ -75,7 +85,13 @@ def run(create_node: Callable[[], Any], stop: StopFlag, arguments: Sequence[str]
 
     rclpy.init(args=None if arguments is None else list(arguments), signal_handler_options=SignalHandlerOptions.NO)
     try:
-        node = create_node()
+        try:
+            stop.raises = not stop.set
+            node = create_node()
+        except Stopped:
+            return
+        finally:
+            stop.raises = False
         try:
             spin(node, stop)
         finally:

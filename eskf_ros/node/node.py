@@ -23,7 +23,7 @@ from eskf_ros.filter.warm_start import Memory
 from eskf_ros.node import robot_localization, transforms
 from eskf_ros.node.cdr import ImuReader, ImuSample, imu_from_message
 from eskf_ros.node.clocks import SECOND, Stamp, StampMonitor
-from eskf_ros.node.declare import LiveParameters, declare, given_names, unused_overrides
+from eskf_ros.node.declare import LiveParameters, declare, unused_overrides
 from eskf_ros.node.extrinsics import ANTENNA, IMU, Extrinsics
 from eskf_ros.node.memory import read_memory, write_memory
 from eskf_ros.node.messages import bias_message, fix_message, record_statuses
@@ -55,9 +55,7 @@ class EskfNode(Node):
         self.verdicts: dict[tuple[int, Verdict], int] = {}
         self.resets = 0
         self.longest_callback = 0.0
-        self.extrinsics = Extrinsics(
-            self.parameters.frames.base_link, given_names(self), self.parameters.frames.extrinsics == "auto"
-        )
+        self.extrinsics = Extrinsics(self.parameters)
         self._frames_met: set[tuple[str, str | bytes]] = set()
         self._is_judging = False
         self._is_simulated = bool(self.get_parameter("use_sim_time").value)
