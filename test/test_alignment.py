@@ -288,13 +288,20 @@ def test_level_and_heading_draws_match_their_covariance() -> None:
     assert_chi_square(squares, 6)
 
 
-def driving(velocity: Any, velocity_covariance: Any) -> Any:
-    """Return a level filter of unknown heading that GNSS has given this velocity."""
+def driving(velocity: Any, velocity_covariance: Any, heading: float | None = None, search_std: float = 0.1) -> Any:
+    """Return a level filter of unknown heading that GNSS has given this velocity.
+
+    The accelerations have told the search a heading (default: the course) with ``search_std`` (rad).
+    """
     state = make_state((100.0, 50.0, 0.0), velocity, Rotation.from_euler("z", 1.0))
     state["heading_known"] = 0
     core(state)[:] = np.diag(np.repeat([1.0, 0.1, 0.002, 0.02, 1e-3], 3) ** 2)
     core(state)[8, 8] = math.pi**2
     core(state)[3:5, 3:5] = velocity_covariance
+    turn = (math.atan2(velocity[1], velocity[0]) if heading is None else heading) - 1.0
+    state["search_started"] = 1
+    state["search"][4:6] = math.cos(turn), math.sin(turn)
+    state["search_covariance"][4:6, 4:6] = search_std**2 * np.eye(2)
     return state
 
 
@@ -309,7 +316,7 @@ def test_course_alignment_is_as_good_as_it_says() -> None:
         course = heading + math.radians(1.0) * rng.normal()
         velocity = speed * np.array([math.cos(course), math.sin(course)])
         velocity = velocity + rng.multivariate_normal([0.0, 0.0], covariance)
-        state = driving((*velocity, 0.0), covariance)
+        state = driving((*velocity, 0.0), covariance, heading)
         alignment.align_to_course(state, settings)
         assert state["heading_known"] == 1
         off = math.remainder(heading - alignment.heading_of(state, settings), 2.0 * math.pi)
@@ -342,6 +349,30 @@ def test_course_is_taken_only_when_it_means_something(
     if not aligned:
         np.testing.assert_array_equal(state["attitude"], before["attitude"])
         np.testing.assert_array_equal(core(state), core(before))
+
+
+@pytest.mark.parametrize(
+    ("heading_deg", "search_std", "found_deg"),
+    [
+        (0.0, 0.1, 0.0),
+        (8.0, 0.1, 0.0),  # the course is sharper than the search
+        (180.0, 0.1, 180.0),  # in reverse
+        (172.0, 0.1, 180.0),
+        (40.0, 0.1, None),  # side slip
+        (90.0, 0.1, None),
+        (0.0, 0.4, None),  # not decided yet
+    ],
+)
+def test_the_course_sharpens_what_the_accelerations_have_decided(
+    heading_deg: float, search_std: float, found_deg: float | None
+) -> None:
+    settings = make_settings()
+    state = driving((8.0, 0.0, 0.0), 0.01 * np.eye(2), math.radians(heading_deg), search_std)
+    alignment.align_to_course(state, settings)
+    assert bool(state["heading_known"]) == (found_deg is not None)
+    if found_deg is not None:
+        off = alignment.heading_of(state, settings) - math.radians(found_deg)
+        assert math.remainder(off, math.tau) == pytest.approx(0.0, abs=1e-9)
 
 
 # ---------------------------------------------------------------------------------------------------- stillness

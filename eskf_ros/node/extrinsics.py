@@ -30,7 +30,7 @@ class Extrinsics:
         self._base_link = parameters.frames.base_link
         values = to_mapping(parameters)
         use_tf = parameters.frames.extrinsics == "auto"
-        self._wanted = {s for s, names in PARAMETERS.items() if use_tf and not any(any(values[n]) for n in names)}
+        self._wanted = {s for s, names in PARAMETERS.items() if use_tf and not np.any([values[n] for n in names])}
         self._parents: dict[str, tuple[str, Pose]] = {}
         self._frames: dict[str, list[str]] = {}
         self._found: dict[str, Pose] = {}
