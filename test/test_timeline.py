@@ -304,6 +304,17 @@ def test_once_level_no_samples_far_behind_are_believed(recording):
     assert navigator.imu_counts["late"] == 50
 
 
+def test_no_samples_far_behind_a_barrier_are_believed(recording):
+    """A service was answered: what it did is not taken back."""
+    navigator = navigator_for(recording)
+    push_imu(navigator, recording, slice(0, 1), 3600 * SECOND)
+    navigator.set_datum(48.0, 11.0, 500.0)
+    before = navigator.state
+    push_imu(navigator, recording, slice(0, 50))
+    assert navigator.state.tobytes() == before.tobytes()
+    assert navigator.imu_counts["late"] == 50
+
+
 def test_nothing_in_a_long_window_is_far_behind(recording):
     """The newest sample comes first: all others are in time, more than ten seconds behind it and in a row."""
     in_order = navigator_for(recording, **{"history.window": 60.0})

@@ -98,13 +98,15 @@ def is_bad_value(force, rate):
 def is_far(timeline, stamp, started):
     """Say whether an IMU stamp is so far from the frontier that one of the two must be wrong.
 
-    Behind it only until the attitude is level (``started``): so far nothing was given out, and the frontier may be a
-    first stamp that was never true. Later what is behind is late, and no message that is in time is ever far.
+    Behind it only until the attitude is level (``started``) or a barrier stands: so far nothing was given out, and the
+    frontier may be a first stamp that was never true. Later what is behind is late. No message in time is ever far.
     """
     if timeline.frontier == NEVER:
         return False
     behind = timeline.frontier - stamp
-    return behind < -LARGEST_JUMP or (started == 0 and behind > max(LARGEST_JUMP, timeline.window))
+    if started == 1 or timeline.barrier != NEVER:
+        return behind < -LARGEST_JUMP
+    return behind < -LARGEST_JUMP or behind > max(LARGEST_JUMP, timeline.window)
 
 
 @njit
