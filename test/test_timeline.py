@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eskf_ros.filter.layout import Verdict
+from eskf_ros.filter.layout import Status, Verdict
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.parameters import from_mapping
 from eskf_ros.simulate.scenario import Recording, simulate
@@ -79,13 +79,16 @@ def result(recording: Recording, messages: list[Message]) -> tuple[dict[str, byt
         if count % 100 == 0:
             records.append(navigator.take_records())
     records.append(navigator.finish())
-    state = navigator.state[0]
-    # Places in the buffers depend on when old contents were dropped; everything else is the estimate.
-    fields = {name: state[name].tobytes() for name in state.dtype.names if name not in ("imu_next", "aid_next")}
     together = np.concatenate(records)
     without_arrival = together.copy()
     without_arrival["arrival"] = 0
-    return fields, without_arrival.tobytes(), together
+    return estimate(navigator), without_arrival.tobytes(), together
+
+
+def estimate(navigator: Navigator) -> dict[str, bytes]:
+    """The state; places in the buffers depend on when old contents were dropped, everything else is the estimate."""
+    state = navigator.state[0]
+    return {name: state[name].tobytes() for name in state.dtype.names if name not in ("imu_next", "aid_next")}
 
 
 def every_message(recording: Recording, random: np.random.Generator, doubled: float) -> list[Message]:
@@ -224,14 +227,100 @@ def test_rows_are_on_the_output_grid(recording, rate):
         assert np.array_equal(rows["stamp"], recording.imu_stamp[level])
 
 
-def test_a_lone_imu_stamp_far_ahead_is_refused(recording):
+def push_imu(navigator: Navigator, recording: Recording, part: slice, shift: np.ndarray | int = 0) -> None:
+    """Push some IMU samples one by one, with ``shift`` (ns) added to their stamps."""
+    stamps = recording.imu_stamp[part] + shift
+    for k, (force, rate) in enumerate(zip(recording.specific_force[part], recording.angular_rate[part])):
+        navigator.push_imu(stamps[k : k + 1], force[np.newaxis], rate[np.newaxis])
+
+
+@pytest.mark.parametrize("shifts", [[3600.0], [3600.0] * 15, [3600.0, 7300.0, 20.0, 3650.0, 11.0] * 4])
+def test_imu_stamps_far_ahead_that_do_not_follow_each_other_are_refused(recording, shifts):
     good, bad = navigator_for(recording), navigator_for(recording)
     half = len(recording.imu_stamp) // 2
-    for part in (slice(0, half), slice(half, None)):
-        arguments = (recording.imu_stamp[part], recording.specific_force[part], recording.angular_rate[part])
-        good.push_imu(*arguments)
-        bad.push_imu(*arguments)
-        if part.start == 0:
-            bad.push_imu(recording.imu_stamp[:1] + 3600 * SECOND, recording.specific_force[:1], np.zeros((1, 3)))
-    assert bad.state.tobytes() == good.state.tobytes()
-    assert bad.imu_counts["bad_stamp"] == 1
+    for navigator in (good, bad):
+        push_imu(navigator, recording, slice(0, half))
+    for shift in shifts:
+        push_imu(bad, recording, slice(half, half + 1), round(shift * SECOND))
+    for navigator in (good, bad):
+        push_imu(navigator, recording, slice(half, None))
+    assert estimate(bad) == estimate(good)
+    assert bad.imu_counts["bad_stamp"] == len(shifts)
+
+
+def test_imu_stamps_far_ahead_between_good_ones_are_refused(recording):
+    """They follow each other, but not in a row."""
+    good, bad = navigator_for(recording), navigator_for(recording)
+    push_imu(good, recording, slice(0, None))
+    for k in range(len(recording.imu_stamp)):
+        push_imu(bad, recording, slice(k, k + 1))
+        if 700 <= k < 750:
+            push_imu(bad, recording, slice(k, k + 1), 3600 * SECOND)
+    assert estimate(bad) == estimate(good)
+    assert bad.imu_counts["bad_stamp"] == 50
+
+
+def test_a_clock_set_forward_is_followed(recording):
+    """Ten samples in a row say so: the tenth is believed."""
+    navigator = navigator_for(recording)
+    half = len(recording.imu_stamp) // 2
+    push_imu(navigator, recording, slice(0, half))
+    push_imu(navigator, recording, slice(half, half + 9), 3600 * SECOND)
+    assert navigator.state["stamp"][0] == recording.imu_stamp[half - 1]
+    push_imu(navigator, recording, slice(half + 9, half + 10), 3600 * SECOND)
+    assert navigator.state["stamp"][0] == recording.imu_stamp[half + 9] + 3600 * SECOND
+
+
+@pytest.mark.parametrize("ahead", [12.0, 3600.0, 1e9])
+@pytest.mark.parametrize("count", [1, 5])
+def test_a_wrong_first_stamp_costs_nine_samples(recording, ahead, count):
+    """Also when a fix came before it, and another while everything looked too late."""
+    good, bad = navigator_for(recording), navigator_for(recording)
+    messages = arriving(
+        recording, every_message(recording, np.random.default_rng(0), 0.0), np.random.default_rng(0), (0.0, 0.1, 0.1)
+    )
+    push(bad, recording, Message(POSITION, 0, 0.0, 0))
+    push_imu(bad, recording, slice(0, count), round(ahead * SECOND))
+    push(bad, recording, Message(POSITION, 0, 0.0, 0))
+    for message in messages:
+        push(bad, recording, message)
+        if message.stream != IMU or message.row >= 9:
+            push(good, recording, message)
+    assert estimate(bad) == estimate(good)
+    assert bad.odometry.tobytes() == good.odometry.tobytes()
+    assert bad.imu_counts["bad_stamp"] == 9
+    assert bad.window_needed == 0.0
+    assert bad.status == good.status == Status.GOOD
+
+
+def test_once_level_no_samples_far_behind_are_believed(recording):
+    """What was published is not taken back: they are late, however many say the same."""
+    navigator = navigator_for(recording)
+    half = len(recording.imu_stamp) // 2
+    push_imu(navigator, recording, slice(0, half))
+    before = navigator.state
+    push_imu(navigator, recording, slice(0, 50), -3600 * SECOND)
+    assert navigator.state.tobytes() == before.tobytes()
+    assert navigator.imu_counts["late"] == 50
+
+
+def test_no_samples_far_behind_a_barrier_are_believed(recording):
+    """A service was answered: what it did is not taken back."""
+    navigator = navigator_for(recording)
+    push_imu(navigator, recording, slice(0, 1), 3600 * SECOND)
+    navigator.set_datum(48.0, 11.0, 500.0)
+    before = navigator.state
+    push_imu(navigator, recording, slice(0, 50))
+    assert navigator.state.tobytes() == before.tobytes()
+    assert navigator.imu_counts["late"] == 50
+
+
+def test_nothing_in_a_long_window_is_far_behind(recording):
+    """The newest sample comes first: all others are in time, more than ten seconds behind it and in a row."""
+    in_order = navigator_for(recording, **{"history.window": 60.0})
+    newest_first = navigator_for(recording, **{"history.window": 60.0})
+    push_imu(in_order, recording, slice(0, None))
+    push_imu(newest_first, recording, slice(-1, None))
+    push_imu(newest_first, recording, slice(0, -1))
+    assert estimate(newest_first) == estimate(in_order)
+    assert newest_first.imu_counts["bad_stamp"] == 0

@@ -229,7 +229,8 @@ TIMELINE = np.dtype(
         ("imu_late", "i8"),
         ("imu_bad_value", "i8"),
         ("imu_bad_stamp", "i8"),
-        ("imu_ahead", "i8"),
+        ("elsewhere_count", "i8"),
+        ("elsewhere_stamp", "i8"),
     ],
     align=True,
 )
@@ -237,7 +238,8 @@ TIMELINE = np.dtype(
 
 ``recorded``: aids at the head of the buffer whose final record was handed out. ``published``: newest stamp for which
 a row was written. ``barrier``: nothing older is accepted. ``furthest_late``: largest lateness (ns) refused.
-``imu_ahead``: refused samples in a row whose stamps were far ahead.
+``elsewhere_count``: refused samples in a row that follow each other far from the frontier; ``elsewhere_stamp``: the
+last one's stamp.
 """
 
 SETTINGS = np.dtype(

@@ -338,7 +338,9 @@ class Navigator:
         while first < len(stamps):
             self._make_room()
             batch = min(first + IMU_BATCH, len(stamps))
-            first = insert_imu(self._imu, self._timeline, stamps[:batch], specific_force, angular_rate, first)
+            first = insert_imu(
+                self._imu, self._timeline, self._local, stamps[:batch], specific_force, angular_rate, first
+            )
             parts.append(self.update())
         return parts[0] if len(parts) == 1 else np.concatenate([np.zeros(0, ODOMETRY), *parts])
 

@@ -36,10 +36,11 @@ LARGEST_RATE = 100.0
 """What no strapdown IMU on a robot reads (m/s2, rad/s)."""
 
 LARGEST_JUMP = 10_000_000_000
-"""A stamp this far (ns) ahead of the frontier is not believed ..."""
+"""A stamp this far (ns) from the frontier is not believed ..."""
 
 JUMP_CONFIRMATIONS = 10
-"""... until so many IMU samples in a row say the same."""
+LONGEST_STEP = 1_000_000_000
+"""... until so many IMU samples in a row go on from there, each at most this much (ns) after the one before."""
 
 
 @njit
@@ -94,11 +95,45 @@ def is_bad_value(force, rate):
 
 
 @njit
-def insert_imu(imu, timeline, stamps, specific_force, angular_rate, first):
+def is_far(timeline, stamp, started):
+    """Say whether an IMU stamp is so far from the frontier that one of the two must be wrong.
+
+    Behind it only until the attitude is level (``started``) or a barrier stands: so far nothing was given out, and the
+    frontier may be a first stamp that was never true. Later what is behind is late. No message in time is ever far.
+    """
+    if timeline.frontier == NEVER:
+        return False
+    behind = timeline.frontier - stamp
+    if started == 1 or timeline.barrier != NEVER:
+        return behind < -LARGEST_JUMP
+    return behind < -LARGEST_JUMP or behind > max(LARGEST_JUMP, timeline.window)
+
+
+@njit
+def confirm_jump(timeline, stamp):
+    """Count a sample far from the frontier; say whether enough of them in a row follow each other."""
+    follows = 0 < stamp - timeline.elsewhere_stamp <= LONGEST_STEP
+    timeline.elsewhere_count = timeline.elsewhere_count + 1 if follows else 1
+    timeline.elsewhere_stamp = stamp
+    return timeline.elsewhere_count >= JUMP_CONFIRMATIONS
+
+
+@njit
+def begin_again(timeline):
+    """Take back all IMU samples: the next advance starts from the blank state, with the aids that are there."""
+    timeline.imu_count = 0
+    timeline.frontier = NEVER
+    timeline.published = NEVER
+    timeline.furthest_late = 0
+    go_back_to(timeline, NEVER)
+
+
+@njit
+def insert_imu(imu, timeline, locals_, stamps, specific_force, angular_rate, first):
     """Sort samples ``first`` and following into the buffer; return how many were taken before it was full.
 
-    Each is checked at the door: finite, possible, stamp neither too old nor absurdly far ahead. Of two with one stamp
-    the one with the smaller bits stays.
+    Each is checked at the door: finite, possible, stamp neither too old nor absurdly far from the others. Of two with
+    one stamp the one with the smaller bits stays.
     """
     t = timeline[0]
     k = first
@@ -114,17 +149,17 @@ def insert_imu(imu, timeline, stamps, specific_force, angular_rate, first):
         if stamp <= 0:
             t.imu_bad_stamp += 1
             continue
-        if t.frontier != NEVER:
-            if stamp < oldest_in_time(t):
-                t.imu_late += 1
-                t.furthest_late = max(t.furthest_late, t.frontier - stamp)
+        if is_far(t, stamp, locals_[0].started):
+            if not confirm_jump(t, stamp):
+                t.imu_bad_stamp += 1
                 continue
-            if stamp > t.frontier + LARGEST_JUMP:
-                t.imu_ahead += 1
-                if t.imu_ahead < JUMP_CONFIRMATIONS:
-                    t.imu_bad_stamp += 1
-                    continue
-        t.imu_ahead = 0
+            if stamp < t.frontier:
+                begin_again(t)
+        elif stamp < oldest_in_time(t):
+            t.imu_late += 1
+            t.furthest_late = max(t.furthest_late, t.frontier - stamp)
+            continue
+        t.elsewhere_count = 0
         place = t.imu_count
         while place > 0 and imu[place - 1].stamp > stamp:
             place -= 1
