@@ -117,11 +117,8 @@ def reference(recording: Any) -> tuple[Navigator, NDArray[Any], NDArray[Any]]:
     for log_time, topic, i in merged:
         m = messages[topic][i]
         if topic == "imu/data":
-            part = slice(i, i + 1)
-            imu = messages[topic][part]
-            produced = navigator.push_imu(
-                imu["stamp"], imu["linear_acceleration"], imu["angular_velocity"], times[topic][part]
-            )
+            imu = messages[topic][i : i + 1]
+            produced = navigator.push_imu(imu["stamp"], imu["linear_acceleration"], imu["angular_velocity"])
             rows += [produced] if len(produced) else []
         elif in_outage(m["stamp"], first_stamp):
             continue

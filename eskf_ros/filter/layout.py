@@ -343,7 +343,6 @@ ODOMETRY = np.dtype(
         ("angular_rate_body", "f8", (3,)),
         ("pose_covariance", "f8", (6, 6)),
         ("twist_covariance", "f8", (6, 6)),
-        ("velocity_covariance_map", "f8", (3, 3)),
         ("accel_bias", "f8", (3,)),
         ("gyro_bias", "f8", (3,)),
         ("accel_bias_std", "f8", (3,)),

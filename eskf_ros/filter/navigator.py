@@ -318,17 +318,10 @@ class Navigator:
         raise_barrier(self._states, self._blank, self._timeline)
         return True
 
-    def push_imu(
-        self,
-        stamps: StampArray,
-        specific_force: FloatArray,
-        angular_rate: FloatArray,
-        arrivals: StampArray | None = None,
-    ) -> np.ndarray:
+    def push_imu(self, stamps: StampArray, specific_force: FloatArray, angular_rate: FloatArray) -> np.ndarray:
         """Take IMU samples, shapes (n,), (n, 3) m/s2, (n, 3) rad/s in IMU axes, and run the filter up to the newest.
 
         Returns the ODOMETRY rows of the newly processed samples on the output grid, as they would have been published.
-        ``arrivals`` is not used: IMU samples leave no records.
         """
         stamps = np.ascontiguousarray(stamps, np.int64)
         specific_force = np.ascontiguousarray(specific_force, np.float64)

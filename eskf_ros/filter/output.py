@@ -166,15 +166,12 @@ def write_pose_covariance(covariance, imu_offset, row):
 
 @njit
 def write_twist_covariance(state, base_to_map, settings, row):
-    """Write velocity covariance in map axes, and the 6x6 covariance of the twist in base_link axes."""
+    """Write the 6x6 covariance of the twist in base_link axes."""
     covariance = state.covariance
     # The sway of the mounting offset is known in body axes: an attitude error turns only the velocity of the IMU.
     velocity = (state.velocity_map[0], state.velocity_map[1], state.velocity_map[2])
     # What the rate error times the mounting offset adds to the velocity is left out: millimetres per second.
     rate_variance = settings.gyro_noise_density**2 / state.imu_interval
-    for i in range(3):
-        for j in range(3):
-            row.velocity_covariance_map[i, j] = covariance[VELOCITY + i, VELOCITY + j]
     for i in range(3):
         forward_i = (base_to_map[0][i], base_to_map[1][i], base_to_map[2][i])
         lever_i = cross(forward_i, velocity)

@@ -73,9 +73,7 @@ class Feed:
             nonlocal done
             while imu is not None and done < end:
                 part = slice(done, min(end, done + LARGEST_PUSH))
-                rows.append(
-                    self._navigator.push_imu(stamps[part], specific_force[part], angular_rate[part], imu.log_time[part])
-                )
+                rows.append(self._navigator.push_imu(stamps[part], specific_force[part], angular_rate[part]))
                 done = part.stop
 
         for place, stream, arguments in self._offers(batch):
