@@ -60,12 +60,14 @@ FEWEST = 4
 LOWEST_ALTITUDE = -10e3
 HIGHEST_ALTITUDE = 100e3
 _ITERATIONS = 12
-_CONVERGED = 1e-4
+# A step so much smaller than the standard deviation is the last: Huber's weights may take many more to settle.
+_NEGLIGIBLE = 0.01
 # While steps are longer than this, elevations mean nothing: no mask.
 _NEAR = 1e4
 # With so much redundancy the scale of the residuals can be told from the faults among them.
 _REDUNDANCY_FOR_SCALE = 5
 _TESTABLE = 1e-3
+_FEWEST_HOLDING = 0.2
 
 
 @dataclass
@@ -147,9 +149,11 @@ def solve(
         return solution
     ionosphere = NO_KLOBUCHAR if klobuchar is None else np.asarray(klobuchar, np.float64)
     epoch = _Epoch(ranges, solution.predictions, week, seconds, ionosphere, settings)
-    _solve_position(epoch, usable, initial, solution)
-    if solution.status == SolutionStatus.SOLVED:
-        _solve_velocity(epoch, solution)
+    # Numbers beyond all measure end in a status, not in a warning.
+    with np.errstate(all="ignore"):
+        _solve_position(epoch, usable, initial, solution)
+        if solution.status == SolutionStatus.SOLVED:
+            _solve_velocity(epoch, solution)
     return solution
 
 
@@ -212,39 +216,48 @@ def _solve_position(epoch: _Epoch, usable: Mask, initial: Array | None, solution
     unknowns = np.zeros(4 + len(others))
     unknowns[:3] = _below(ranges["satellite"][usable]) if initial is None else initial
 
-    rows = usable
+    weights = np.ones(len(ranges))
+    faulty = np.zeros(len(ranges), np.bool_)
+    low = weak = faulty
     adjusted = None
     near = False
-    for _ in range(2 * _ITERATIONS):
+    # Each fault that is found costs a few steps more.
+    for _ in range(2 * _ITERATIONS + 2 * len(ranges)):
         epoch.predict(unknowns[:3], np.zeros(3))
         if near:
-            _mask(ranges, predictions, settings)
-            rows = usable & (ranges["status"] == Status.USABLE)
+            low = predictions["elevation"] < settings.elevation_mask
+            weak = ranges["cn0"] < settings.cn0_mask
+        rows = usable & ~(faulty | low | weak)
+        if np.count_nonzero(rows) < FEWEST:
+            solution.status = SolutionStatus.TOO_FEW
+            return
         design = np.zeros((len(ranges), len(unknowns)))
         design[:, :3] = -predictions["line_of_sight"]
         design[:, 3] = 1.0
         for column, group in enumerate(others, start=4):
             design[groups == group, column] = 1.0
         residual = predictions["code_residual"] - design[:, 3:] @ unknowns[3:]
-        if np.count_nonzero(rows) < FEWEST:
-            solution.status = SolutionStatus.TOO_FEW
-            return
         huber = settings.huber if near else math.inf
-        adjusted = _adjust(design[rows], residual[rows], predictions["code_std"][rows], unknowns, prior_std, huber)
+        adjusted = _adjust(
+            design[rows], residual[rows], predictions["code_std"][rows], weights[rows], unknowns, prior_std, huber
+        )
         if adjusted is None or not np.isfinite(adjusted.step).all():
             solution.status = SolutionStatus.POOR_GEOMETRY
             return
         unknowns = unknowns + adjusted.step
+        weights[rows] = adjusted.weights
         length = float(np.linalg.norm(adjusted.step[:3]))
-        if near and length < _CONVERGED:
-            faults = _faults(adjusted, settings)
-            if faults is None:
+        if near and length < adjusted.negligible_step:
+            fault = _fault(adjusted, settings)
+            if fault is None:
                 break
-            ranges["status"][np.flatnonzero(rows)[faults]] = Status.OUTLIER
+            faulty[np.flatnonzero(rows)[fault]] = True
         near = near or length < _NEAR
     else:
         solution.status = SolutionStatus.NOT_CONVERGED
         return
+    for left_out, status in ((low, Status.LOW_ELEVATION), (weak, Status.LOW_CN0), (faulty, Status.OUTLIER)):
+        ranges["status"][usable & left_out] = status
     covariance = adjusted.covariance * adjusted.variance_factor
     altitude = ecef_to_geodetic(*unknowns[:3].tolist())[2]
     if not math.sqrt(np.trace(covariance[:3, :3])) < settings.poorest_std:
@@ -270,38 +283,42 @@ def _below(satellites: Array) -> Array:
     return np.asarray(middle * (SEMI_MAJOR_AXIS / np.linalg.norm(middle)))
 
 
-def _mask(ranges: NDArray[np.void], predictions: NDArray[np.void], settings: PointSettings) -> None:
-    """Give usable ranges that are too low or too weak their status; what was masked stays so."""
-    usable = ranges["status"] == Status.USABLE
-    ranges["status"][usable & (predictions["elevation"] < settings.elevation_mask)] = Status.LOW_ELEVATION
-    ranges["status"][usable & (ranges["cn0"] < settings.cn0_mask)] = Status.LOW_CN0
-
-
 class _Adjustment(NamedTuple):
     """A linear least-squares solution: step, its covariance, residuals after it, what their std says about each."""
 
     step: Array
     covariance: Array
+    weights: Array
+    """Huber's weights."""
     normalized: Array
     """Residuals in units of the standard deviation of the measurement."""
     freedom: Array
     """Share of each measurement's error that shows in its residual (redundancy number), 0 to 1."""
     redundancy: int
+    scale: float
+    """`_scale` of the residuals."""
     variance_factor: float
+
+    @property
+    def negligible_step(self) -> float:
+        """Length of a step of the first three unknowns that changes nothing any more."""
+        return _NEGLIGIBLE * math.sqrt(np.trace(self.covariance[:3, :3]))
 
 
 def _adjust(
-    design: Array, residual: Array, std: Array, unknowns: Array, prior_std: Array, huber: float
+    design: Array, residual: Array, std: Array, weights: Array, unknowns: Array, prior_std: Array, huber: float
 ) -> _Adjustment | None:
     """Solve design @ step = residual with standard deviations ``std`` and Huber's weights; None when it is singular.
 
-    ``prior_std``: standard deviations with which the ``unknowns`` are known to be zero (inf for not at all).
-    Iteratively reweighted least squares (Huber, Robust Statistics, section 7.8).
+    ``weights``: to start from. ``prior_std``: standard deviations with which the ``unknowns`` are known to be zero (inf
+    for not at all). ``huber``: residual in standard deviations from which on weights go down. Iteratively
+    reweighted least squares (Huber, Robust Statistics, section 7.8): the sum it minimises is convex, so that neither
+    the start nor an outlier of any size leads it astray.
     """
     whitened, observed = design / std[:, None], residual / std
     prior = np.diag(1.0 / prior_std**2)
+    redundancy = len(residual) - len(unknowns) + int(np.count_nonzero(prior))
     pull = -prior @ unknowns
-    weights = np.ones(len(residual))
     for _ in range(_ITERATIONS):
         try:
             covariance = np.linalg.inv(whitened.T @ (weights[:, None] * whitened) + prior)
@@ -313,32 +330,41 @@ def _adjust(
         weights = np.minimum(1.0, huber / np.maximum(np.abs(normalized), 1e-12))
         if np.abs(weights - previous).max() < 1e-3:
             break
-    known = int(np.count_nonzero(np.isfinite(prior_std)))
-    redundancy = len(residual) - len(unknowns) + known
     leverage = np.einsum("ij,jk,ik->i", whitened, covariance, whitened) * weights
     after = unknowns + step
     square_sum = float(weights @ normalized**2 + after @ prior @ after)
-    factor = max(1.0, square_sum / redundancy) if redundancy > 0 else 1.0
-    return _Adjustment(step, covariance, normalized, 1.0 - leverage, redundancy, factor)
+    # A range whose weight follows its residual no longer holds the solution in place: only the others count.
+    holding = max(_FEWEST_HOLDING, float(np.mean(weights == 1.0)))
+    factor = max(1.0, square_sum / redundancy / holding) if redundancy > 0 else 1.0
+    scale = _scale(normalized, redundancy)
+    return _Adjustment(step, covariance, weights, normalized, 1.0 - leverage, redundancy, scale, factor)
 
 
-def _faults(adjusted: _Adjustment, settings: PointSettings) -> int | None:
+def _scale(normalized: Array, redundancy: int) -> float:
+    """Return by how much residuals are larger than their standard deviations say, at least 1.
+
+    From their median, which a third of faults does not change much. With little redundancy a fault and large errors
+    throughout look the same: 1.
+    """
+    if redundancy < _REDUNDANCY_FOR_SCALE:
+        return 1.0
+    return max(1.0, 1.4826 * float(np.median(np.abs(normalized))) * math.sqrt(len(normalized) / redundancy))
+
+
+def _fault(adjusted: _Adjustment, settings: PointSettings) -> int | None:
     """Return the index of the measurement that is most clearly a fault, None when there is none.
 
-    Baarda's data snooping: each residual in units of its own standard deviation (Baarda 1968, A testing procedure for
-    use in geodetic networks). Where redundancy allows, in units of their median too, so that an epoch with large
-    errors throughout (streets) is not stripped to the ranges that happen to agree; the variance factor covers it.
+    Baarda's data snooping (A testing procedure for use in geodetic networks, 1968): each residual in units of its own
+    standard deviation, here times `_scale`, so that an epoch with large errors throughout is not stripped to the ranges
+    that happen to agree; the variance factor covers it.
     """
     testable = adjusted.freedom > _TESTABLE
     if adjusted.redundancy < 2 or not testable.any():
         return None
     tested = np.zeros(len(testable))
     tested[testable] = np.abs(adjusted.normalized[testable]) / np.sqrt(adjusted.freedom[testable])
-    scale = 1.0
-    if adjusted.redundancy >= _REDUNDANCY_FOR_SCALE:
-        scale = max(1.0, 1.4826 * float(np.median(tested[testable])))
     worst = int(np.argmax(tested))
-    return worst if tested[worst] > settings.exclusion * scale else None
+    return worst if tested[worst] > settings.exclusion * adjusted.scale else None
 
 
 def _solve_velocity(epoch: _Epoch, solution: PointSolution) -> None:
@@ -347,7 +373,8 @@ def _solve_velocity(epoch: _Epoch, solution: PointSolution) -> None:
     # A reflected code is no reason to distrust the Doppler.
     rows = np.isin(ranges["status"], (Status.USABLE, Status.OUTLIER)) & (ranges["flags"] & DOPPLER_VALID != 0)
     unknowns, unbounded = np.zeros(4), np.full(4, math.inf)
-    for _ in range(_ITERATIONS):
+    weights = np.ones(len(ranges))
+    for _ in range(_ITERATIONS + 2 * len(ranges)):
         epoch.predict(solution.position_ecef, unknowns[:3])
         rows &= np.isfinite(predictions["doppler_residual"])
         if np.count_nonzero(rows) < FEWEST:
@@ -355,13 +382,14 @@ def _solve_velocity(epoch: _Epoch, solution: PointSolution) -> None:
         design = np.concatenate([-predictions["line_of_sight"][rows], np.ones((np.count_nonzero(rows), 1))], axis=1)
         residual = predictions["doppler_residual"][rows] - unknowns[3]
         std = predictions["doppler_std"][rows]
-        adjusted = _adjust(design, residual, std, unknowns, unbounded, settings.huber)
+        adjusted = _adjust(design, residual, std, weights[rows], unknowns, unbounded, settings.huber)
         if adjusted is None or not np.isfinite(adjusted.step).all():
             solution.velocity_status = SolutionStatus.POOR_GEOMETRY
             return
         unknowns = unknowns + adjusted.step
-        if np.linalg.norm(adjusted.step[:3]) < _CONVERGED:
-            fault = _faults(adjusted, settings)
+        weights[rows] = adjusted.weights
+        if np.linalg.norm(adjusted.step[:3]) < adjusted.negligible_step:
+            fault = _fault(adjusted, settings)
             if fault is None:
                 break
             rows[np.flatnonzero(rows)[fault]] = False
