@@ -228,7 +228,7 @@ def test_a_gain_frozen_after_convergence_is_worse_through_a_tunnel_and_after_it(
     """
     frozen_at, tunnel = 100.0, (215.0, 260.0)
     errors: dict[float, list[tuple[np.ndarray, np.ndarray]]] = {}
-    for seed in range(4):
+    for seed in range(8):
         # Without latency the two see the same: the opponent works in the order of stamps.
         recording = simulate("drive", seed, outages=(tunnel,), latency=(0.0, 0.0))
         parameters = from_mapping({**recording.parameters(), **NO_SIDE_SLIP})
