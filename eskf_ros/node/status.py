@@ -64,8 +64,8 @@ def waiting_for(node: EskfNode, status: Status, now: int) -> list[str]:
     if status in (Status.WAITING_FIX, Status.COASTING):
         return missing(node, names.gnss_fix, now) or ["fixes come, but none was accepted lately: see eskf/aids"]
     if status == Status.WAITING_HEADING:
-        speed = node.parameters.alignment.course_min_speed
-        return missing(node, names.gnss_fix, now) or [f"heading: drive forward faster than {speed:g} m/s"]
+        way = "speeding up, braking or turning tells the heading, a constant velocity does not"
+        return missing(node, names.gnss_fix, now) or [way]
     return []
 
 
