@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pymap3d
+from inertial_oracle import integrate
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from eskf_ros.bags import open_bag
 from eskf_ros.simulate.gnss import GnssMeasurements
-from eskf_ros.simulate.motion import Motion
+from eskf_ros.simulate.imu import ImuMount, ideal_samples
+from eskf_ros.simulate.map_frame import MapFrame
+from eskf_ros.simulate.motion import Motion, Trajectory
 from eskf_ros.simulate.scenario import DATUM, START_STAMP, trajectory
 
 Array = NDArray[np.float64]
+
+FRAME = MapFrame(DATUM)
 
 TOPICS = {
     "imu/data": "sensor_msgs/msg/Imu",
@@ -78,3 +84,22 @@ def antenna_errors(name: str, gnss: GnssMeasurements, lever_arm: tuple[float, fl
     velocity_ecef = np.stack(pymap3d.enu2ecefv(*velocity_map.T, DATUM[0], DATUM[1]), axis=-1)
     east, north, up = pymap3d.ecef2enuv(*velocity_ecef.T, latitude, longitude)
     return position_error, gnss.velocity_enu - np.stack([east, north, up], axis=-1)
+
+
+def assert_imu_integrates_back(path: Trajectory, times: Sequence[float], mount: ImuMount) -> None:
+    """The ideal IMU samples, integrated in the inertial frame by other means, give position, velocity and attitude."""
+    at = np.array(times)
+    truth = path.motion(at)
+    imu_to_map = attitude(truth) * Rotation.from_euler("xyz", mount.rpy_deg, degrees=True)
+    position, velocity = truth.position_of(mount.position), truth.velocity_of(mount.position)
+
+    def inputs(t: float) -> tuple[Array, Array]:
+        force, rate = ideal_samples(path, FRAME, np.array([t]), mount)
+        return force[0], rate[0]
+
+    start = (position[0], velocity[0], imu_to_map[0].as_quat()[[3, 0, 1, 2]])
+    integrated = integrate(inputs, start, DATUM, at, path.breakpoints)
+    np.testing.assert_allclose(integrated.position_map, position, atol=1e-7)
+    np.testing.assert_allclose(integrated.velocity_map, velocity, atol=1e-8)
+    difference = Rotation.from_quat(integrated.attitude_body_to_map[:, [1, 2, 3, 0]]).inv() * imu_to_map
+    assert np.abs(difference.magnitude()).max() < 1e-11

@@ -10,15 +10,13 @@ from typing import Any
 import numpy as np
 import pymap3d
 import pytest
-from inertial_oracle import integrate
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from simulated import TOPICS, antenna_errors, assert_chi_square, attitude, read, seconds
+from simulated import FRAME, TOPICS, antenna_errors, assert_chi_square, assert_imu_integrates_back, read, seconds
 
 from eskf_ros import parameters
 from eskf_ros.simulate import main as command
 from eskf_ros.simulate.imu import GRADES, ImuMount, SensorErrors, grade_parameters, ideal_interval_means, ideal_samples
-from eskf_ros.simulate.map_frame import MapFrame
 from eskf_ros.simulate.scenario import (
     DATUM,
     SCENARIOS,
@@ -27,84 +25,11 @@ from eskf_ros.simulate.scenario import (
     simulate,
     trajectory,
 )
-from eskf_ros.simulate.trajectory import DriveTrajectory, Hold, SpeedTo, Turn
 
 Array = NDArray[np.float64]
 
 CHECKOUT = Path(__file__).resolve().parent.parent
-FRAME = MapFrame(DATUM)
 LEVER_ARM = (0.8, -0.2, 1.4)
-
-
-# ------------------------------------------------------------------------------------------------------- trajectory
-
-
-@pytest.mark.parametrize("name", ["drive", "tunnel_drive"])
-def test_truth_is_its_own_derivative(name: str) -> None:
-    path = trajectory(name)
-    t = np.random.default_rng(1).uniform(0.01, path.duration - 0.01, 4000)
-    h = 2e-3
-    # Differences across a joint of the polynomials are less exact: higher derivatives jump there.
-    t = t[np.abs(t[:, None] - path.breakpoints).min(axis=1) > 2.0 * h]
-    before2, before, here, after, after2 = (path.motion(t + k * h) for k in (-2, -1, 0, 1, 2))
-
-    def derivative(quantity: str) -> Array:
-        """Central differences of fourth order."""
-        b2, b, a, a2 = (getattr(motion, quantity) for motion in (before2, before, after, after2))
-        return (b2 - 8.0 * b + 8.0 * a - a2) / (12.0 * h)
-
-    np.testing.assert_allclose(derivative("position_map"), here.velocity_map, atol=2e-9)
-    np.testing.assert_allclose(derivative("velocity_map"), here.acceleration_map, atol=2e-9)
-    np.testing.assert_allclose(derivative("angular_rate_body"), here.angular_acceleration_body, atol=2e-9)
-    turned = (attitude(before).inv() * attitude(after)).as_rotvec() / (2.0 * h)
-    turned2 = (attitude(before2).inv() * attitude(after2)).as_rotvec() / (4.0 * h)
-    np.testing.assert_allclose((4.0 * turned - turned2) / 3.0, here.angular_rate_body, atol=2e-9)
-
-
-def test_position_is_the_integral_of_velocity() -> None:
-    path = trajectory("tunnel_drive")
-    nodes, weights = np.polynomial.legendre.leggauss(40)
-    position = np.zeros(3)
-    for begin, end in zip(path.breakpoints[:-1], path.breakpoints[1:], strict=True):
-        half = 0.5 * (end - begin)
-        position += half * weights @ path.motion(begin + half * (1.0 + nodes)).velocity_map
-        np.testing.assert_allclose(path.motion(end).position_map[0], position, atol=1e-10)
-
-
-def test_acceleration_and_angular_rate_have_no_jumps() -> None:
-    path = trajectory("drive")
-    at = path.breakpoints[1:-1]
-    before, after = path.motion(at - 1e-7), path.motion(at + 1e-7)
-    for quantity in ("acceleration_map", "angular_rate_body", "angular_acceleration_body"):
-        np.testing.assert_allclose(getattr(before, quantity), getattr(after, quantity), atol=1e-6)
-
-
-def test_heading_follows_the_velocity_and_the_body_leans_outward() -> None:
-    path = DriveTrajectory([SpeedTo(10.0, 2.0), Hold(5.0), Turn(90.0, 2.0), SpeedTo(0.0, 2.0)], heading_deg=30.0)
-    t = np.arange(0.5, path.duration - 0.5, 0.1)
-    motion = path.motion(t)
-    rpy = attitude(motion).as_euler("ZYX")[:, ::-1]
-    track = np.arctan2(motion.velocity_map[:, 1], motion.velocity_map[:, 0])
-    np.testing.assert_allclose(rpy[:, 2], track, atol=1e-12)
-    assert math.degrees(rpy[0, 2]) == pytest.approx(30.0)
-    assert math.degrees(rpy[-1, 2]) == pytest.approx(120.0)
-    # In a turn to the left the right side goes down; braking lowers the nose. REP-103: both positive.
-    left = np.argmax(motion.angular_rate_body[:, 2])
-    assert math.degrees(rpy[left, 0]) == pytest.approx(4.0 * 2.0 / 9.80665, rel=0.02)
-    flat = DriveTrajectory([SpeedTo(10.0), SpeedTo(0.0)], hills=())
-    braking = flat.motion(flat.duration - 2.5)
-    assert math.degrees(attitude(braking).as_euler("ZYX")[0, 1]) == pytest.approx(2.0 * 2.0 / 9.80665, rel=1e-6)
-
-
-def test_impossible_instructions_are_refused() -> None:
-    with pytest.raises(ValueError, match="turns only while it moves"):
-        DriveTrajectory([Turn(90.0)])
-    with pytest.raises(ValueError, match="differ from the present one"):
-        DriveTrajectory([SpeedTo(5.0), SpeedTo(5.0)])
-    with pytest.raises(ValueError, match="must be positive"):
-        DriveTrajectory([Hold(0.0)])
-    with pytest.raises(ValueError, match="within the trajectory"):
-        DriveTrajectory([Hold(2.0)]).motion(2.1)
 
 
 # -------------------------------------------------------------------------------------------------------------- IMU
@@ -123,23 +48,8 @@ def test_still_imu_feels_gravity_and_the_rotation_of_the_earth() -> None:
 
 def test_imu_integrates_back_to_the_truth() -> None:
     """Through a start, turns and a stop, with an IMU mounted off base_link and askew, in the inertial frame."""
-    path = trajectory("tunnel_drive")
     mount = ImuMount((0.7, -0.4, 0.9), (3.0, -5.0, 100.0))
-    times = np.array([18.0, 24.0, 30.0, 45.0, 60.0])
-    truth = path.motion(times)
-    imu_to_map = attitude(truth) * Rotation.from_euler("xyz", mount.rpy_deg, degrees=True)
-    position, velocity = truth.position_of(mount.position), truth.velocity_of(mount.position)
-
-    def inputs(t: float) -> tuple[Array, Array]:
-        force, rate = ideal_samples(path, FRAME, np.array([t]), mount)
-        return force[0], rate[0]
-
-    start = (position[0], velocity[0], imu_to_map[0].as_quat()[[3, 0, 1, 2]])
-    integrated = integrate(inputs, start, DATUM, times, path.breakpoints)
-    np.testing.assert_allclose(integrated.position_map, position, atol=1e-7)
-    np.testing.assert_allclose(integrated.velocity_map, velocity, atol=1e-8)
-    difference = Rotation.from_quat(integrated.attitude_body_to_map[:, [1, 2, 3, 0]]).inv() * imu_to_map
-    assert np.abs(difference.magnitude()).max() < 1e-11
+    assert_imu_integrates_back(trajectory("tunnel_drive"), [18.0, 24.0, 30.0, 45.0, 60.0], mount)
 
 
 def test_interval_mean_is_the_mean() -> None:
@@ -275,18 +185,6 @@ def test_tunnel_drive_is_what_it_says() -> None:
     assert np.count_nonzero(np.diff((np.abs(yaw_rate) > 0.05).astype(int)) == 1) >= 8
     assert recording.options.lever_arm == LEVER_ARM
     np.testing.assert_array_equal(np.diff(recording.imu_stamp), 5_000_000)
-
-
-def test_every_scenario_starts_and_ends_at_rest() -> None:
-    for name, found in SCENARIOS.items():
-        path = trajectory(name)
-        ends = path.motion([0.0, path.duration])
-        assert np.abs(ends.velocity_map).max() < 1e-9, name
-        assert all(0.0 <= first < last <= path.duration for first, last in found.outages)
-        rough = path.motion(np.linspace(0.0, path.duration, 5000))
-        assert np.linalg.norm(rough.acceleration_map, axis=1).max() < 4.0
-    assert trajectory("hour_drive").duration == pytest.approx(3600.0, abs=1.0)
-    assert 270.0 < trajectory("drive").duration < 330.0
 
 
 def test_truth_lies_on_imu_stamps_whatever_the_rates() -> None:

@@ -58,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="eskf_simulate",
-        description="Write a simulated drive as a rosbag2 recording (mcap) with IMU, GNSS and truth. "
+        description="Write a simulated motion as a rosbag2 recording (mcap) with IMU, GNSS, truth and other sensors. "
         "The same scenario, seed and options give the same recording.",
     )
     parser.add_argument("scenario", nargs="?", metavar="SCENARIO", help=f"one of {', '.join(SCENARIOS)}")

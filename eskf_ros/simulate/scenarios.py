@@ -2,23 +2,46 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
-from eskf_ros.simulate.trajectory import DriveTrajectory, Hold, Instruction, SpeedTo, Turn
+from eskf_ros.simulate.aeroplane import AeroplaneTrajectory
+from eskf_ros.simulate.boat import BoatTrajectory
+from eskf_ros.simulate.motion import Trajectory
+from eskf_ros.simulate.multirotor import Land, Leg, MultirotorTrajectory, TakeOff
+from eskf_ros.simulate.profile import (
+    ClimbTo,
+    FlightInstruction,
+    Hold,
+    Instruction,
+    LiftOff,
+    SpeedTo,
+    TouchDown,
+    Turn,
+    TurnInPlace,
+)
+from eskf_ros.simulate.trajectory import DriveTrajectory
+from eskf_ros.simulate.walk import WalkTrajectory
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """A drive and where it has no GNSS.
+    """A motion and where it has no GNSS.
 
+    ``move`` makes the motion from ``heading_deg``, the heading at the start, counter-clockwise from east (REP-103).
     ``outages`` are intervals (first, last) in seconds from time zero; no GNSS message has a stamp within one.
     """
 
     description: str
-    instructions: tuple[Instruction, ...]
+    move: Callable[[float], Trajectory]
     heading_deg: float
     outages: tuple[tuple[float, float], ...] = ()
+
+
+def _drive(instructions: Sequence[Instruction], **options: Any) -> Callable[[float], Trajectory]:
+    return lambda heading_deg: DriveTrajectory(instructions, heading_deg, **options)
 
 
 _CITY_LAP: tuple[Instruction, ...] = (
@@ -48,56 +71,200 @@ _CITY_LAP: tuple[Instruction, ...] = (
     Hold(5.0),
 )
 
+_ROWS: tuple[Instruction, ...] = (
+    SpeedTo(0.8, 0.4),
+    Hold(15.0),
+    SpeedTo(0.0, 0.4),
+    TurnInPlace(90.0),
+    SpeedTo(0.5, 0.4),
+    Hold(1.0),
+    SpeedTo(0.0, 0.4),
+    TurnInPlace(90.0),
+    SpeedTo(1.0, 0.4),
+    Hold(12.0),
+    SpeedTo(0.0, 0.4),
+    Hold(3.0),
+    TurnInPlace(-90.0),
+    SpeedTo(0.5, 0.4),
+    Hold(1.0),
+    SpeedTo(0.0, 0.4),
+    TurnInPlace(-90.0, 25.0),
+)
+
+_WALK: tuple[Instruction, ...] = (
+    Hold(15.0),
+    SpeedTo(1.4, 0.8),
+    Hold(25.0),
+    Turn(90.0, 0.8),
+    Hold(15.0),
+    SpeedTo(0.0, 0.8),
+    Hold(8.0),
+    TurnInPlace(-60.0, 60.0),
+    SpeedTo(1.1, 0.6),
+    Hold(20.0),
+    Turn(-100.0, 0.6),
+    SpeedTo(1.8, 0.5),
+    Hold(20.0),
+    Turn(40.0, 0.8),
+    SpeedTo(1.3, 0.5),
+    Hold(20.0),
+    SpeedTo(0.0, 0.8),
+    Hold(10.0),
+)
+
+_FLIGHT = (
+    Leg(20.0),
+    TakeOff(8.0, (0.0, 0.0, 12.0)),
+    Leg(15.0),
+    Leg(12.0, (-20.0, 35.0, 0.0)),
+    Leg(4.0),
+    Leg(12.0, (45.0, 20.0, 8.0), turn_deg=60.0),
+    Leg(6.0, turn_deg=-150.0),
+    Leg(14.0, (10.0, -60.0, -5.0)),
+    Leg(20.0),
+    Leg(12.0, (-35.0, 5.0, 0.0), turn_deg=45.0),
+    Land(14.0, (0.0, 0.0, -15.0)),
+    Leg(10.0),
+)
+
+_CIRCUIT: tuple[FlightInstruction, ...] = (
+    Hold(20.0),
+    SpeedTo(30.0, 3.0),
+    LiftOff(),
+    ClimbTo(6.0),
+    Hold(20.0),
+    SpeedTo(45.0, 1.5),
+    ClimbTo(0.0),
+    Turn(-90.0, 3.0),
+    Hold(15.0),
+    Turn(-180.0, 3.5),
+    Hold(25.0),
+    Turn(270.0, 4.5),
+    Turn(-90.0, 3.0),
+    Hold(15.0),
+    # The way up in reverse: the runway is as high as it was.
+    ClimbTo(-6.0),
+    SpeedTo(30.0, 1.5),
+    Hold(20.0),
+    ClimbTo(0.0),
+    TouchDown(),
+    SpeedTo(0.0, 3.0),
+    Hold(10.0),
+)
+
+_CRUISE: tuple[Instruction, ...] = (
+    Hold(40.0),
+    SpeedTo(2.5, 0.3),
+    Hold(60.0),
+    Turn(-70.0, 0.15),
+    Hold(50.0),
+    SpeedTo(1.2, 0.2),
+    Turn(160.0, 0.08),
+    Hold(60.0),
+    SpeedTo(0.0, 0.2),
+    Hold(60.0),
+)
+
 SCENARIOS: dict[str, Scenario] = {
     "drive": Scenario(
         "five minutes in a city: two laps around blocks, with turns and stops",
-        (Hold(20.0), *_CITY_LAP, *_CITY_LAP, Hold(5.0)),
+        _drive((Hold(20.0), *_CITY_LAP, *_CITY_LAP, Hold(5.0))),
         heading_deg=35.0,
     ),
     "tunnel_drive": Scenario(
         "stand still 20 s, drive with turns and stops, a tunnel of 45 s at speed, and on",
-        (
-            Hold(20.0),
-            SpeedTo(8.0),
-            Turn(80.0, 2.5),
-            SpeedTo(13.0),
-            Hold(6.0),
-            Turn(-60.0, 2.5),
-            SpeedTo(0.0, 2.5),
-            Hold(6.0),
-            SpeedTo(7.0, 2.5),
-            Turn(-95.0, 2.5),
-            SpeedTo(12.0),
-            Turn(30.0),
-            Turn(-30.0),
-            SpeedTo(0.0),
-            Hold(4.0),
-            SpeedTo(7.0),
-            Turn(90.0, 2.5),
-            SpeedTo(17.0),
-            Hold(8.0),
-            # The tunnel begins about here and bends to the left.
-            Hold(15.0),
-            Turn(35.0, 1.0),
-            SpeedTo(15.0, 0.8),
-            Hold(13.0),
-            Turn(-20.0, 1.0),
-            Hold(12.0),
-            SpeedTo(7.0),
-            Turn(90.0, 2.5),
-            SpeedTo(11.0),
-            Hold(8.0),
-            Turn(-40.0),
-            SpeedTo(0.0),
-            Hold(8.0),
+        _drive(
+            (
+                Hold(20.0),
+                SpeedTo(8.0),
+                Turn(80.0, 2.5),
+                SpeedTo(13.0),
+                Hold(6.0),
+                Turn(-60.0, 2.5),
+                SpeedTo(0.0, 2.5),
+                Hold(6.0),
+                SpeedTo(7.0, 2.5),
+                Turn(-95.0, 2.5),
+                SpeedTo(12.0),
+                Turn(30.0),
+                Turn(-30.0),
+                SpeedTo(0.0),
+                Hold(4.0),
+                SpeedTo(7.0),
+                Turn(90.0, 2.5),
+                SpeedTo(17.0),
+                Hold(8.0),
+                # The tunnel begins about here and bends to the left.
+                Hold(15.0),
+                Turn(35.0, 1.0),
+                SpeedTo(15.0, 0.8),
+                Hold(13.0),
+                Turn(-20.0, 1.0),
+                Hold(12.0),
+                SpeedTo(7.0),
+                Turn(90.0, 2.5),
+                SpeedTo(11.0),
+                Hold(8.0),
+                Turn(-40.0),
+                SpeedTo(0.0),
+                Hold(8.0),
+            )
         ),
         heading_deg=-20.0,
         outages=((125.0, 170.0),),
     ),
     "hour_drive": Scenario(
         "one hour of city laps, for measuring speed",
-        (Hold(20.0), *(_CITY_LAP * 27), Hold(47.5)),
+        _drive((Hold(20.0), *(_CITY_LAP * 27), Hold(47.5))),
         heading_deg=35.0,
+    ),
+    "reverse_start": Scenario(
+        "a car backs out of its place before it drives",
+        _drive(
+            (
+                Hold(20.0),
+                SpeedTo(-2.0, 1.0),
+                Hold(3.0),
+                Turn(70.0, 1.0),
+                SpeedTo(0.0, 1.0),
+                Hold(3.0),
+                SpeedTo(6.0),
+                Turn(-70.0, 2.5),
+                *_CITY_LAP,
+            )
+        ),
+        heading_deg=110.0,
+    ),
+    "parked": Scenario("a car stands for ten minutes", _drive((Hold(600.0),)), heading_deg=-75.0),
+    "motorway": Scenario(
+        "five minutes straight on at 33 m/s: nothing to tell heading and biases apart",
+        _drive((Hold(300.0),), speed=33.0, hills=()),
+        heading_deg=62.0,
+    ),
+    "field_robot": Scenario(
+        "a slow robot on uneven ground: rows, with turns in place between them",
+        _drive((Hold(15.0), *(_ROWS * 4), Hold(10.0)), hills=((0.05, 9.0), (0.025, 2.6))),
+        heading_deg=0.0,
+    ),
+    "walk": Scenario(
+        "a person with the sensors in the hand: steps, turns, stops, never quite at rest",
+        lambda heading_deg: WalkTrajectory(_WALK, heading_deg),
+        heading_deg=80.0,
+    ),
+    "multirotor": Scenario(
+        "take-off, hover, legs in all directions but forward, drifting in the wind, landing",
+        lambda heading_deg: MultirotorTrajectory(_FLIGHT, heading_deg),
+        heading_deg=25.0,
+    ),
+    "aeroplane": Scenario(
+        "take-off, climb, coordinated turns in wind, descent, landing",
+        lambda heading_deg: AeroplaneTrajectory(_CIRCUIT, heading_deg),
+        heading_deg=-100.0,
+    ),
+    "boat": Scenario(
+        "a slow boat that rolls, pitches and heaves in waves and drifts with the current, never at rest",
+        lambda heading_deg: BoatTrajectory(_CRUISE, heading_deg),
+        heading_deg=150.0,
     ),
 }
 
@@ -110,7 +277,7 @@ def scenario(name: str) -> Scenario:
 
 
 @lru_cache(maxsize=4)
-def trajectory(name: str) -> DriveTrajectory:
+def trajectory(name: str) -> Trajectory:
     """Return the motion of scenario ``name``; ValueError names those there are."""
     found = scenario(name)
-    return DriveTrajectory(found.instructions, found.heading_deg)
+    return found.move(found.heading_deg)

@@ -63,7 +63,7 @@ def spelled(name: str, kind: type) -> str:
 
 def _shown(field: dataclasses.Field[Any]) -> str:
     value = field.default
-    if value is dataclasses.MISSING:
+    if value is dataclasses.MISSING or value is None:
         return field.name.upper()
     if isinstance(value, tuple):
         return "/".join(f"{number:g}" for number in value)

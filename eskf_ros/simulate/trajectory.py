@@ -1,10 +1,9 @@
 """The motion of a simulated car: driving instructions turned into a smooth trajectory.
 
-Acceleration along the road and yaw rate are piecewise polynomials of time (ramps of `SMOOTH_STEP`, so three times
-continuously differentiable); speed, distance and heading are their exact integrals. base_link is the middle of the rear
-axle: its velocity points along the heading, up and down with the slope of the road. The body squats with acceleration
-and rolls with lateral acceleration. Velocity, acceleration, attitude and angular rate are closed expressions of these;
-only position is a quadrature, exact to rounding. So all of them are derivatives of each other to machine precision.
+Speed, distance and heading are those of `eskf_ros.simulate.profile`. base_link is the middle of the rear axle: its
+velocity points along the heading, up and down with the slope of the road. The body squats with acceleration and rolls
+with lateral acceleration. Velocity, acceleration, attitude and angular rate are closed expressions of these; only
+position is a quadrature, exact to rounding. So all of them are derivatives of each other to machine precision.
 
 All of it is in ``map``: a frame rigidly fixed to the Earth, x east, y north, z up at the datum.
 """
@@ -13,21 +12,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PPoly
 
 from eskf_ros.simulate.motion import Motion, checked_times
+from eskf_ros.simulate.profile import Instruction, Profile, stacked
+from eskf_ros.simulate.quadrature import PositionIntegral
 
 Array = NDArray[np.float64]
-
-SMOOTH_STEP = (-20.0, 70.0, -84.0, 35.0, 0.0, 0.0, 0.0, 0.0)
-"""Coefficients, highest power first, of the step from 0 to 1 on [0, 1] whose first three derivatives vanish at both."""
-
-RAMP_DURATION = 1.2
-"""Seconds in which acceleration or yaw rate build up and fade."""
 
 PITCH_PER_ACCELERATION = math.radians(2.0) / 9.80665
 ROLL_PER_ACCELERATION = math.radians(4.0) / 9.80665
@@ -35,35 +29,6 @@ ROLL_PER_ACCELERATION = math.radians(4.0) / 9.80665
 
 HILLS = ((0.030, 700.0), (0.015, 190.0))
 """Slope of the road over the distance driven: a sum of sines, each (amplitude in rad, wave length in m)."""
-
-_KNOT_INTERVAL = 0.1
-_GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(5)
-
-
-@dataclass(frozen=True)
-class Hold:
-    """Keep speed and heading for ``duration`` seconds: stand still at speed zero, else cruise straight on."""
-
-    duration: float
-
-
-@dataclass(frozen=True)
-class SpeedTo:
-    """Change to ``speed`` (m/s), straight on, with at most ``acceleration`` (m/s2)."""
-
-    speed: float
-    acceleration: float = 2.0
-
-
-@dataclass(frozen=True)
-class Turn:
-    """Turn by ``angle_deg`` (left positive) at the present speed with at most ``lateral_acceleration`` (m/s2)."""
-
-    angle_deg: float
-    lateral_acceleration: float = 2.0
-
-
-Instruction = Hold | SpeedTo | Turn
 
 
 class DriveTrajectory:
@@ -79,28 +44,20 @@ class DriveTrajectory:
         """Prepare the drive.
 
         ``heading_deg`` is the heading at the start, counter-clockwise from east (REP-103), ``speed`` the speed there
-        in m/s. Raises ValueError for an instruction that cannot be followed (a turn while standing, a negative speed).
+        in m/s, backwards below zero. Raises ValueError for an instruction that cannot be followed (a turn while
+        standing).
         """
-        pieces = _Pieces(speed)
-        for instruction in instructions:
-            pieces.add(instruction)
-        self.breakpoints: Array = np.array(pieces.breakpoints)
+        profile = Profile(instructions, speed)
+        self.breakpoints: Array = profile.breakpoints
         """Times (s) at which the fourth derivative of speed and heading may jump; the last is the end."""
-        rates = PPoly(np.stack([pieces.acceleration, pieces.yaw_rate], axis=-1).transpose(1, 0, 2), self.breakpoints)
+        rates = profile.rates("speed", "yaw")
         states = rates.antiderivative()
         states.c[-1] += (speed, math.radians(heading_deg))
         distance = PPoly(states.c[..., :1], self.breakpoints).antiderivative()
-        self._way = _stacked(distance, states)
-        self._profile = _stacked(distance, states, rates, rates.derivative(), rates.derivative(2))
+        self._way = stacked(distance, states)
+        self._profile = stacked(distance, states, rates, rates.derivative(), rates.derivative(2))
         self._hills = tuple(hills)
-        counts = np.ceil(np.diff(self.breakpoints) / _KNOT_INTERVAL).astype(int)
-        starts = [
-            np.linspace(begin, end, count, endpoint=False)
-            for begin, end, count in zip(self.breakpoints[:-1], self.breakpoints[1:], counts, strict=True)
-        ]
-        self._knots = np.concatenate([*starts, self.breakpoints[-1:]])
-        increments = self._displacement(self._knots[:-1], self._knots[1:])
-        self._knot_positions = np.vstack([np.zeros(3), np.cumsum(increments, axis=0)])
+        self._position = PositionIntegral(self._velocity, self.breakpoints)
 
     @property
     def duration(self) -> float:
@@ -140,10 +97,8 @@ class DriveTrajectory:
             (roll_rate, pitch_rate, yaw_rate),
             (roll_acceleration, pitch_acceleration, yaw_acceleration),
         )
-        before = np.clip(np.searchsorted(self._knots, t, side="right") - 1, 0, len(self._knots) - 2)
-        position = self._knot_positions[before] + self._displacement(self._knots[before], t)
         return Motion(
-            position_map=position,
+            position_map=self._position(t),
             velocity_map=speed[:, None] * along,
             acceleration_map=acceleration_map,
             attitude_body_to_map=_quaternions(roll, pitch, yaw),
@@ -162,69 +117,11 @@ class DriveTrajectory:
             curvature -= wave_number * wave_number * sine
         return slope, gradient, curvature
 
-    def _displacement(self, begin: Array, end: Array) -> Array:
-        """Return the way (n, 3) from ``begin`` to ``end`` (n,) by Gauss quadrature; none may cross a knot."""
-        half = 0.5 * (end - begin)
-        distance, speed, yaw = np.moveaxis(self._way(begin[:, None] + half[:, None] * (1.0 + _GAUSS_NODES)), -1, 0)
+    def _velocity(self, times: Array) -> tuple[Array, Array, Array]:
+        distance, speed, yaw = np.moveaxis(self._way(times), -1, 0)
         slope = self._slope(distance)[0]
         level = speed * np.cos(slope)
-        ways = (level * np.cos(yaw), level * np.sin(yaw), speed * np.sin(slope))
-        return np.stack([half * (way @ _GAUSS_WEIGHTS) for way in ways], axis=-1)
-
-
-class _Pieces:
-    """Collects the polynomial pieces (degree 7) of acceleration and yaw rate."""
-
-    def __init__(self, speed: float) -> None:
-        self.breakpoints = [0.0]
-        self.acceleration: list[Array] = []
-        self.yaw_rate: list[Array] = []
-        self._speed = speed
-
-    def add(self, instruction: Instruction) -> None:
-        if isinstance(instruction, Hold):
-            if instruction.duration <= 0.0:
-                raise ValueError(f"{instruction}: the duration must be positive")
-            self._append(instruction.duration, np.zeros(8), np.zeros(8))
-        elif isinstance(instruction, SpeedTo):
-            if instruction.speed < 0.0 or instruction.speed == self._speed:
-                raise ValueError(f"{instruction}: the speed must differ from the present one and not be negative")
-            self._window(instruction.speed - self._speed, instruction.acceleration, self.acceleration)
-            self._speed = instruction.speed
-        else:
-            if self._speed <= 0.0 or instruction.angle_deg == 0.0:
-                raise ValueError(f"{instruction}: a car turns only while it moves, and by an angle other than zero")
-            yaw_rate = instruction.lateral_acceleration / self._speed
-            self._window(math.radians(instruction.angle_deg), yaw_rate, self.yaw_rate)
-
-    def _window(self, change: float, limit: float, pieces: list[Array]) -> None:
-        """Append a ramp up, a plateau and a ramp down whose integral is ``change``."""
-        plateau = abs(change) / limit - RAMP_DURATION
-        if plateau <= 0.0:
-            plateau = 0.0
-            limit = abs(change) / RAMP_DURATION
-        peak = math.copysign(limit, change)
-        up = peak * np.array(SMOOTH_STEP) / RAMP_DURATION ** np.arange(7, -1, -1)
-        level = np.zeros(8)
-        level[-1] = peak
-        for duration, shape in ((RAMP_DURATION, up), (plateau, level), (RAMP_DURATION, level - up)):
-            if duration > 0.0:
-                if pieces is self.acceleration:
-                    self._append(duration, shape, np.zeros(8))
-                else:
-                    self._append(duration, np.zeros(8), shape)
-
-    def _append(self, duration: float, acceleration: Array, yaw_rate: Array) -> None:
-        self.breakpoints.append(self.breakpoints[-1] + duration)
-        self.acceleration.append(acceleration)
-        self.yaw_rate.append(yaw_rate)
-
-
-def _stacked(*polynomials: PPoly) -> PPoly:
-    """Return one polynomial that has all values of several; one evaluation is quicker than several."""
-    order = max(len(polynomial.c) for polynomial in polynomials)
-    padded = [np.pad(p.c, ((order - len(p.c), 0), (0, 0), (0, 0))) for p in polynomials]
-    return PPoly(np.concatenate(padded, axis=-1), polynomials[0].x)
+        return level * np.cos(yaw), level * np.sin(yaw), speed * np.sin(slope)
 
 
 def _quaternions(roll: Array, pitch: Array, yaw: Array) -> Array:

@@ -1,0 +1,45 @@
+"""A small boat in waves and in a current."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from eskf_ros.simulate.path import PathState, PathTrajectory, Pose, waves
+from eskf_ros.simulate.taylor import Taylor, sin_cos
+
+CURRENT = (0.35, -0.25)
+"""Velocity of the water, east and north, m/s."""
+
+_HEAVE = ((0.25, 0.16, 0.0), (0.12, 0.27, 1.3))
+_SURGE = ((0.15, 0.16, 1.6), (0.06, 0.27, 2.9))
+_SWAY = ((0.12, 0.14, 0.4), (0.05, 0.24, 2.0))
+_ROLL = ((math.radians(6.0), 0.19, 0.2), (math.radians(2.5), 0.31, 1.0))
+_PITCH = ((math.radians(2.5), 0.16, 0.9), (math.radians(1.0), 0.29, 0.1))
+_YAW = ((math.radians(2.0), 0.11, 0.0),)
+"""Motion in the waves, m and rad; see `waves`."""
+
+
+class BoatTrajectory(PathTrajectory):
+    """A boat that heads through the water as it is told and drifts with the current; it never is at rest."""
+
+    def velocity(self, state: PathState) -> Sequence[Taylor]:
+        """Return the velocity over ground without the waves."""
+        sine, cosine = sin_cos(state.yaw)
+        return state.speed * cosine + CURRENT[0], state.speed * sine + CURRENT[1], 0.0 * state.speed
+
+    def pose(self, state: PathState, way: Sequence[Taylor]) -> Pose:
+        """Return the pose in the waves."""
+        sine, cosine = sin_cos(state.yaw)
+        surge, sway = waves(state.time, _SURGE), waves(state.time, _SWAY)
+        position = (
+            way[0] + cosine * surge - sine * sway,
+            way[1] + sine * surge + cosine * sway,
+            way[2] + waves(state.time, _HEAVE),
+        )
+        turns = (
+            ("z", state.yaw + waves(state.time, _YAW)),
+            ("y", waves(state.time, _PITCH)),
+            ("x", waves(state.time, _ROLL)),
+        )
+        return Pose(position, turns)
