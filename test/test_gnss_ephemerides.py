@@ -266,6 +266,41 @@ def test_satellites_that_come_with_the_range_are_kept() -> None:
     assert observed["carrier_hz"][0] == 1575.42e6
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("satellite", [1e9, 0.0, 0.0]),
+        ("satellite", [1e5, 0.0, 0.0]),
+        ("satellite_velocity", [2e4, 0.0, 0.0]),
+        ("satellite_clock", 0.2),
+        ("satellite_clock", math.inf),
+        ("satellite_clock_drift", 1e-3),
+        ("satellite_clock_drift", math.nan),
+    ],
+)
+def test_impossible_satellites_do_not_pass_the_door(name: str, value: Any) -> None:
+    observed = epoch((Gnss.GPS, 5, "1C"), (Gnss.GPS, 6, "1C"))
+    observed["flags"] |= SATELLITE_KNOWN
+    observed["satellite"], observed["satellite_velocity"] = [2e7, 1e7, 5e6], [1.0, 2.0, 3.0]
+    observed["satellite_clock"], observed["satellite_clock_drift"] = 1e-4, 0.0
+    observed[name][1] = value
+    locate(observed, WEEK, TOE, Ephemerides())
+    assert list(observed["status"]) == [Status.USABLE, Status.BAD_VALUE]
+
+
+def test_impossible_numbers_become_unknown(tmp_path: Path) -> None:
+    observed = epoch(*[(Gnss.GPS, 5, "1C")] * 4)
+    observed["cn0"] = [45.0, -3.0, 1e9, math.inf]
+    observed["pseudorange_std"] = [2.0, 0.0, -1.0, math.inf]
+    observed["doppler_std"] = [0.5, 0.0, -1.0, math.nan]
+    observed["carrier_hz"] = [1575.42e6, 0.0, -1.0, math.inf]
+    locate(observed, WEEK, TOE, everything(tmp_path))
+    for name, first in (("cn0", 45.0), ("pseudorange_std", 2.0), ("doppler_std", 0.5)):
+        np.testing.assert_array_equal(observed[name], [first, math.nan, math.nan, math.nan])
+    assert (observed["carrier_hz"] == 1575.42e6).all()
+    assert (observed["status"] == Status.USABLE).all()
+
+
 @given(
     st.lists(
         st.tuples(

@@ -22,7 +22,6 @@ from eskf_ros.gnss.signals import GNSS_COUNT, Gnss, time_group
 from eskf_ros.gnss.weighting import DEFAULT_WEIGHTING, Weighting
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 class SolutionStatus(IntEnum):
@@ -78,8 +77,9 @@ class PointSolution:
     ``reference``) and ``clock_drift`` (m/s) with standard deviations; ``system_offset`` (8,): m by
     `signals.time_group`, by what a range of that group is longer than one of ``reference`` (NaN without ranges).
     ``covariance``s are formal, and grow with the residuals where these are larger than modelled; ``variance_factor``
-    tells by how much. ``ranges`` are the given ones with their final status, ``predictions`` (PREDICTION) theirs;
-    ``used`` is the number of ranges in the position, ``velocity_used`` in the velocity.
+    tells by how much. ``ranges`` are the given ones with their final status, ``predictions`` (PREDICTION) theirs, NaN
+    for those that were not usable; ``used`` is the number of ranges in the position, ``velocity_used`` in the
+    velocity.
     """
 
     status: SolutionStatus
@@ -143,22 +143,22 @@ def solve(
     ECEF (m) to start from; not needed. Never raises for bad ranges: they have a status, and so has the solution.
     """
     solution = _blank(ranges)
-    ranges = solution.ranges
     usable = (ranges["status"] == Status.USABLE) & (ranges["flags"] & CODE_VALID != 0)
     if np.count_nonzero(usable) < FEWEST:
         return solution
     ionosphere = NO_KLOBUCHAR if klobuchar is None else np.asarray(klobuchar, np.float64)
-    epoch = _Epoch(ranges, solution.predictions, week, seconds, ionosphere, settings)
+    epoch = _Epoch(ranges[usable], solution.predictions[usable], week, seconds, ionosphere, settings)
     # Numbers beyond all measure end in a status, not in a warning.
     with np.errstate(all="ignore"):
-        _solve_position(epoch, usable, initial, solution)
+        _solve_position(epoch, initial, solution)
         if solution.status == SolutionStatus.SOLVED:
             _solve_velocity(epoch, solution)
+    solution.ranges[usable], solution.predictions[usable] = epoch.ranges, epoch.predictions
     return solution
 
 
 class _Epoch(NamedTuple):
-    """One epoch and how to treat it."""
+    """The usable ranges of one epoch and how to treat them."""
 
     ranges: NDArray[np.void]
     predictions: NDArray[np.void]
@@ -183,6 +183,9 @@ class _Epoch(NamedTuple):
 
 def _blank(ranges: NDArray[np.void]) -> PointSolution:
     nothing = math.nan
+    predictions = np.zeros(len(ranges), PREDICTION)
+    for name in PREDICTION.names or ():
+        predictions[name] = nothing
     return PointSolution(
         status=SolutionStatus.TOO_FEW,
         velocity_status=SolutionStatus.TOO_FEW,
@@ -200,21 +203,21 @@ def _blank(ranges: NDArray[np.void]) -> PointSolution:
         used=0,
         velocity_used=0,
         ranges=ranges.copy(),
-        predictions=np.zeros(len(ranges), PREDICTION),
+        predictions=predictions,
     )
 
 
-def _solve_position(epoch: _Epoch, usable: Mask, initial: Array | None, solution: PointSolution) -> None:
+def _solve_position(epoch: _Epoch, initial: Array | None, solution: PointSolution) -> None:
     """Solve position and clock; write them and the status of each range to ``solution``."""
     ranges, predictions, settings = epoch.ranges, epoch.predictions, epoch.settings
     groups = np.array([time_group(*satellite) for satellite in ranges[["gnss_id", "sv_id"]].tolist()])
     # In the order of `Gnss`, which begins with GPS.
-    reference, *others = np.unique(groups[usable]).tolist()
+    reference, *others = np.unique(groups).tolist()
     prior_std = np.full(4 + len(others), math.inf)
     for column, group in enumerate(others, start=4):
         prior_std[column] = settings.glonass_offset_std if group == Gnss.GLONASS else settings.system_offset_std
     unknowns = np.zeros(4 + len(others))
-    unknowns[:3] = _below(ranges["satellite"][usable]) if initial is None else initial
+    unknowns[:3] = _below(ranges["satellite"]) if initial is None else initial
 
     weights = np.ones(len(ranges))
     faulty = np.zeros(len(ranges), np.bool_)
@@ -227,7 +230,7 @@ def _solve_position(epoch: _Epoch, usable: Mask, initial: Array | None, solution
         if near:
             low = predictions["elevation"] < settings.elevation_mask
             weak = ranges["cn0"] < settings.cn0_mask
-        rows = usable & ~(faulty | low | weak)
+        rows = ~(faulty | low | weak)
         if np.count_nonzero(rows) < FEWEST:
             solution.status = SolutionStatus.TOO_FEW
             return
@@ -257,7 +260,7 @@ def _solve_position(epoch: _Epoch, usable: Mask, initial: Array | None, solution
         solution.status = SolutionStatus.NOT_CONVERGED
         return
     for left_out, status in ((low, Status.LOW_ELEVATION), (weak, Status.LOW_CN0), (faulty, Status.OUTLIER)):
-        ranges["status"][usable & left_out] = status
+        ranges["status"][left_out] = status
     covariance = adjusted.covariance * adjusted.variance_factor
     altitude = ecef_to_geodetic(*unknowns[:3].tolist())[2]
     if not math.sqrt(np.trace(covariance[:3, :3])) < settings.poorest_std:

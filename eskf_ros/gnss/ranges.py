@@ -90,6 +90,15 @@ range. ``satellite``, ``satellite_velocity``: ECEF at transmission (m, m/s), of 
 SHORTEST_PSEUDORANGE = 1e6
 LONGEST_PSEUDORANGE = 1e8
 LARGEST_DOPPLER = 1e5
+# Impossible for a satellite of navigation: nearer, farther, faster, a clock farther off.
+NEAREST_SATELLITE = 6.5e6
+FARTHEST_SATELLITE = 1e8
+FASTEST_SATELLITE = 1e4
+LARGEST_CLOCK = 0.1
+LARGEST_CLOCK_DRIFT = 1e-6
+LOWEST_CARRIER_HZ = 1.1e9
+HIGHEST_CARRIER_HZ = 1.7e9
+HIGHEST_CN0 = 100.0
 
 _UNKNOWN_SIGNAL = int(Status.UNKNOWN_SIGNAL)
 _BAD_VALUE = int(Status.BAD_VALUE)
@@ -120,7 +129,7 @@ def locate(ranges: NDArray[np.void], week: int, seconds: float, ephemerides: Eph
     """Complete the ranges (RANGE, in place) of one epoch with satellite state, carrier and status.
 
     ``week``, ``seconds``: time tag of the epoch by the receiver's clock in GPS time. Ranges that bring their satellite
-    (`SATELLITE_KNOWN`) keep it.
+    (`SATELLITE_KNOWN`) keep it. This is the door: a number that cannot be becomes NaN, or the status says so.
     """
     locate_all(ranges, week, seconds, ephemerides.records, ephemerides.first)
 
@@ -189,10 +198,16 @@ def locate_one(observed, week, seconds, records, first):
         observed["flags"] &= ~CODE_VALID
     if not (abs(observed["doppler"]) < LARGEST_DOPPLER):
         observed["flags"] &= ~DOPPLER_VALID
+    if not 0.0 <= observed["cn0"] < HIGHEST_CN0:
+        observed["cn0"] = math.nan
+    if not 0.0 < observed["pseudorange_std"] < math.inf:
+        observed["pseudorange_std"] = math.nan
+    if not 0.0 < observed["doppler_std"] < math.inf:
+        observed["doppler_std"] = math.nan
+    if not LOWEST_CARRIER_HZ < observed["carrier_hz"] < HIGHEST_CARRIER_HZ:
+        observed["carrier_hz"] = SIGNAL_CARRIER_HZ[signal] if known_signal else math.nan
     if observed["flags"] & SATELLITE_KNOWN:
-        if math.isnan(observed["carrier_hz"]) and known_signal:
-            observed["carrier_hz"] = SIGNAL_CARRIER_HZ[signal]
-        observed["status"] = _USABLE if state_is_finite(observed) else _BAD_VALUE
+        observed["status"] = _USABLE if satellite_is_possible(observed) else _BAD_VALUE
         return
     if not known_signal:
         observed["status"] = _UNKNOWN_SIGNAL
@@ -214,9 +229,9 @@ def locate_one(observed, week, seconds, records, first):
     observed["satellite_clock"] = clock - ephemeris["group_delay"][slot]
     observed["satellite_clock_drift"] = drift
     observed["issue"] = ephemeris["issue"]
-    if gnss == _GLONASS or math.isnan(observed["carrier_hz"]):
+    if gnss == _GLONASS:
         observed["carrier_hz"] = carrier_hz(signal, ephemeris["channel"])
-    if not state_is_finite(observed):
+    if not satellite_is_possible(observed):
         observed["status"] = _BAD_EPHEMERIS
         return
     observed["flags"] |= SATELLITE_KNOWN | GROUP_DELAY_APPLIED
@@ -224,12 +239,18 @@ def locate_one(observed, week, seconds, records, first):
 
 
 @njit
-def state_is_finite(observed):
-    """True when position, velocity and clock of the satellite are numbers."""
-    total = observed["satellite_clock"] + observed["satellite_clock_drift"]
+def satellite_is_possible(observed):
+    """True when position, velocity and clock of the satellite are numbers a satellite of navigation can have."""
+    distance2, speed2 = 0.0, 0.0
     for axis in range(3):
-        total += observed["satellite"][axis] + observed["satellite_velocity"][axis]
-    return math.isfinite(total)
+        distance2 += observed["satellite"][axis] ** 2
+        speed2 += observed["satellite_velocity"][axis] ** 2
+    return (
+        NEAREST_SATELLITE**2 < distance2 < FARTHEST_SATELLITE**2
+        and speed2 < FASTEST_SATELLITE**2
+        and abs(observed["satellite_clock"]) < LARGEST_CLOCK
+        and abs(observed["satellite_clock_drift"]) < LARGEST_CLOCK_DRIFT
+    )
 
 
 @njit
