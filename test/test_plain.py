@@ -99,10 +99,11 @@ from eskf_ros.parameters import from_mapping
 from eskf_ros.simulate.scenario import simulate
 
 navigator.compile_kernels()
+# The simulator compiles some for itself: that is none of the node's business.
+recording = simulate("drive", imu_rate=100.0, start=12.0, stop=62.0)
 found = vars(navigator).items()
 compiled = lambda: {n: len(f.signatures) for n, f in found if isinstance(f, numba.core.dispatcher.Dispatcher)}
 before = compiled()
-recording = simulate("drive", imu_rate=100.0, start=12.0, stop=62.0)
 pilot = navigator.Navigator(from_mapping(recording.parameters()))
 for epoch, stamp in enumerate(recording.fix_stamp):
     part = (recording.imu_stamp <= stamp) & (recording.imu_stamp > pilot.state["imu_stamp"][0])

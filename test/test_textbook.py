@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from eskf_ros.filter.aiding import gnss_position, gnss_velocity
-from eskf_ros.filter.layout import Verdict
+from eskf_ros.filter.layout import Stream, Verdict
 from eskf_ros.filter.strapdown import gravity_map
 from eskf_ros.filter.update import update
 
@@ -54,7 +54,8 @@ def test_altitude_fix() -> None:
 def test_antenna_of_the_van() -> None:
     """Facing north it is at 201.5, 50, -2; facing east at 200, 51.5, -2 (north, east, down)."""
     for facing, expected in ((FACING_NORTH, (201.5, 50.0, -2.0)), (FACING_EAST, (200.0, 51.5, -2.0))):
-        antenna = north_east_down(gnss_position.predict(*van(facing)))
+        state, settings = van(facing)
+        antenna = north_east_down(gnss_position.predict(state, 0, settings))
         np.testing.assert_allclose(antenna, expected, rtol=0.0, atol=1e-12)
 
 
@@ -99,7 +100,7 @@ def test_20_ms_at_30_m_per_s() -> None:
 def test_gate_of_16() -> None:
     """With three degrees of freedom 16.0 is the 99.89 % quantile."""
     assert chi2.cdf(16.0, 3) == pytest.approx(0.9989, abs=5e-5)
-    gate = make_settings(gnss__gate_probability=float(chi2.cdf(16.0, 3)))["gate"][3]
+    gate = make_settings(gnss__gate_probability=float(chi2.cdf(16.0, 3)))["gate"][Stream.GNSS_POSITION, 3]
     assert gate == pytest.approx(16.0, abs=1e-9)
     for distance, expected in ((3.999, Verdict.FUSED), (4.001, Verdict.GATE)):
         state, _ = van(FACING_NORTH)
