@@ -26,7 +26,7 @@ from eskf_ros.gnss.ephemeris import Ephemerides
 from eskf_ros.gnss.geometry import distance, turned, turned_at_arrival
 from eskf_ros.gnss.range_model import NO_KLOBUCHAR, PREDICTION, sight
 from eskf_ros.gnss.ranges import ALREADY_TURNED, CODE_VALID, DOPPLER_VALID, Status, locate_one
-from eskf_ros.gnss.signals import SPEED_OF_LIGHT, time_group
+from eskf_ros.gnss.signals import GNSS_COUNT, SPEED_OF_LIGHT, time_group
 from eskf_ros.gnss.weighting import DEFAULT_WEIGHTING, Weighting
 
 MEASURED_SIGNAL = np.dtype(
@@ -148,7 +148,9 @@ def measure(ranges, week, seconds, receiver, records, first, ionosphere, weighti
 def clear(observed, signal):
     """Fill a MEASURED_SIGNAL from a located RANGE with all that the receiver's position does not decide."""
     signal["gnss_id"], signal["sv_id"], signal["signal"] = observed["gnss_id"], observed["sv_id"], observed["signal"]
-    signal["system"] = time_group(observed["gnss_id"], observed["sv_id"])
+    # An index into tables, also of a signal that is not usable.
+    known = 0 <= observed["gnss_id"] < GNSS_COUNT
+    signal["system"] = time_group(observed["gnss_id"], observed["sv_id"]) if known else 0
     signal["carrier_hz"], signal["cn0"] = observed["carrier_hz"], observed["cn0"]
     signal["noise_factor"] = observed["noise_factor"]
     wavelength = SPEED_OF_LIGHT / observed["carrier_hz"]

@@ -17,6 +17,7 @@ from eskf_ros.compiled import njit
 from eskf_ros.gnss.ephemeris import NO_ISSUE, SATELLITE_KEYS, Ephemerides
 from eskf_ros.gnss.orbits import satellite_state, transmission
 from eskf_ros.gnss.signals import (
+    BEIDOU_3,
     GNSS_COUNT,
     L1,
     SIGNAL_CARRIER_HZ,
@@ -222,6 +223,10 @@ def locate_one(observed, week, seconds, records, first):
         observed["carrier_hz"] = SIGNAL_CARRIER_HZ[signal] if known_signal and gnss != _GLONASS else math.nan
     if observed["flags"] & CLOCK_APPLIED:
         observed["satellite_clock"] = 0.0
+    if not 0 <= gnss < GNSS_COUNT or gnss == BEIDOU_3:
+        # It is an index into tables of constellations.
+        observed["status"] = _UNKNOWN_SIGNAL
+        return
     if observed["flags"] & SATELLITE_KNOWN:
         velocity = observed["satellite_velocity"]
         if math.isnan(velocity[0] + velocity[1] + velocity[2]):
@@ -257,7 +262,8 @@ def locate_one(observed, week, seconds, records, first):
     observed["satellite_clock_drift"] = drift
     observed["issue"] = ephemeris["issue"]
     if gnss == _GLONASS:
-        observed["carrier_hz"] = carrier_hz(signal, ephemeris["channel"])
+        carrier = carrier_hz(signal, ephemeris["channel"])
+        observed["carrier_hz"] = carrier if LOWEST_CARRIER_HZ < carrier < HIGHEST_CARRIER_HZ else math.nan
     if not satellite_is_possible(observed):
         observed["status"] = _BAD_EPHEMERIS
         return
