@@ -59,6 +59,7 @@ setup(
         "console_scripts": [
             "eskf_node = eskf_ros.node.main:main",
             "eskf_replay = eskf_ros.replay.main:main",
+            "eskf_ranges = eskf_ros.ranges.main:main",
             "eskf_simulate = eskf_ros.simulate.main:main",
         ],
     },
