@@ -77,6 +77,7 @@ _TOPIC = {
     "pattern": r"(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*",
     "pattern_text": "a ROS topic name like imu/data or /robot/imu",
 }
+_TYPE = "Message type of this topic, where the driver publishes another one. The replay takes what was recorded."
 
 
 @dataclass(frozen=True)
@@ -107,6 +108,9 @@ class Topics:
         "geometry_msgs/TwistWithCovarianceStamped: velocity of the GNSS antenna, East-North-Up.",
         **_TOPIC,
     )
+    gnss_velocity_type: str = _choice(
+        "geometry_msgs/msg/TwistWithCovarianceStamped", _TYPE, "geometry_msgs/msg/TwistStamped"
+    )
     heading: str = _parameter(
         "gnss/heading", "", "sensor_msgs/Imu: yaw of a dual-antenna receiver, with its covariance.", **_TOPIC
     )
@@ -114,12 +118,24 @@ class Topics:
     wheel: str = _parameter(
         "wheel/odom", "", "nav_msgs/Odometry: wheel odometry, of which speed and yaw rate are used.", **_TOPIC
     )
+    wheel_type: str = _choice(
+        "nav_msgs/msg/Odometry",
+        _TYPE,
+        "geometry_msgs/msg/TwistWithCovarianceStamped",
+        "geometry_msgs/msg/TwistStamped",
+    )
     body_velocity: str = _parameter(
         "body_velocity",
         "",
         "geometry_msgs/TwistWithCovarianceStamped: velocity in the axes of the vehicle, of a DVL, optical flow, radar "
         "or odometry of any kind; an axis with a negative variance is absent.",
         **_TOPIC,
+    )
+    body_velocity_type: str = _choice(
+        "geometry_msgs/msg/TwistWithCovarianceStamped",
+        _TYPE,
+        "geometry_msgs/msg/TwistStamped",
+        "nav_msgs/msg/Odometry",
     )
     baro: str = _parameter("baro", "", "sensor_msgs/FluidPressure: air pressure.", **_TOPIC)
 

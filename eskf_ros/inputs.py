@@ -1,9 +1,19 @@
-"""What a recording is asked for: one row per kind of input, and how its messages become arguments of a push."""
+"""The inputs of the estimator but for the IMU: one row each, for the node and for the replay alike.
+
+Both read serialised messages into batches (`eskf_ros.bags`), a recording by the thousand and the node one by one; from
+there on they share what is here, so that they give the estimator the same numbers, bit for bit.
+
+A new input is a row of `INPUTS`, a function that makes arguments of its messages, and the parameter ``topics.NAME``; a
+message type that is not there yet is a row of `bags.messages.MESSAGE_TYPES`. A second type for the same thing is an
+entry in ``others`` and a choice of the parameter ``topics.NAME_type``.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,8 +21,10 @@ from numpy.typing import NDArray
 
 from eskf_ros.bags import Batch
 from eskf_ros.filter.layout import Stream
+from eskf_ros.filter.navigator import Navigator
 
 Arguments = Iterable[tuple[Any, ...]]
+Converter = Callable[[Batch], Arguments]
 
 UNMEASURED = -1.0
 
@@ -22,14 +34,35 @@ class Input:
     """One kind of input: the parameter ``topics.NAME``, its stream, the message type.
 
     ``arguments`` turns a batch into those of the push of this stream, one tuple per message that begins with the stamp
-    (ns). ``is_gnss``: withheld in an outage.
+    (ns). ``others``: further types that say the same, with what makes arguments of them. ``push``: the method of
+    `Navigator` that takes the arguments; empty: `Navigator.push`, with the stream. ``is_gnss``: withheld in an outage.
+    ``by_receiver``: two receivers may share the topic, told apart by the frame. ``depth``: messages that may wait in
+    the node while the computer is busy elsewhere, a second of a fast sensor.
     """
 
     name: str
     stream: Stream
     type: str
-    arguments: Callable[[Batch], Arguments]
+    arguments: Converter
+    others: tuple[tuple[str, Converter], ...] = ()
+    push: str = ""
     is_gnss: bool = False
+    by_receiver: bool = False
+    depth: int = 1000
+
+    @property
+    def types(self) -> tuple[str, ...]:
+        """All message types it can be, the usual one first."""
+        return (self.type, *(name for name, _ in self.others))
+
+    def of_type(self, name: str) -> Input:
+        """The same input, read from messages of another of its types."""
+        converters = {self.type: self.arguments, **dict(self.others)}
+        return dataclasses.replace(self, type=name, arguments=converters[name], others=())
+
+    def push_of(self, navigator: Navigator) -> Callable[..., None]:
+        """What takes the arguments."""
+        return getattr(navigator, self.push) if self.push else partial(navigator.push, self.stream)  # type: ignore[no-any-return]
 
 
 def _listed(column: NDArray[Any]) -> list[Any]:
@@ -48,9 +81,20 @@ def _fixes(batch: Batch) -> Arguments:
 
 
 def _gnss_velocities(batch: Batch) -> Arguments:
-    covariances = batch.messages["twist_covariance"].reshape(-1, 6, 6)[:, :3, :3].reshape(-1, 9)
-    columns = _listed(batch.messages["stamp"]), _listed(batch.messages["linear_velocity"]), _listed(covariances)
+    columns = _listed(batch.messages["stamp"]), _listed(batch.messages["linear_velocity"]), _listed(_linear(batch))
     return zip(*columns, batch.log_time.tolist(), _frames(batch), strict=True)
+
+
+def _twist_covariances(batch: Batch) -> NDArray[np.float64]:
+    """Covariances (n, 6, 6) of the twists; all zero where the type of the messages has none."""
+    names = batch.messages.dtype.names or ()
+    given = batch.messages["twist_covariance"] if "twist_covariance" in names else np.zeros((len(batch.messages), 36))
+    return given.reshape(-1, 6, 6)
+
+
+def _linear(batch: Batch) -> NDArray[np.float64]:
+    """Covariances (n, 9) of the linear velocities."""
+    return _twist_covariances(batch)[:, :3, :3].reshape(-1, 9)
 
 
 def _vectors(batch: Batch, values: NDArray[Any], covariances: NDArray[Any]) -> Arguments:
@@ -73,8 +117,7 @@ def _headings(batch: Batch) -> Arguments:
 
 
 def _body_velocities(batch: Batch) -> Arguments:
-    covariances = batch.messages["twist_covariance"].reshape(-1, 6, 6)[:, :3, :3].reshape(-1, 9)
-    return _vectors(batch, batch.messages["linear_velocity"], covariances)
+    return _vectors(batch, batch.messages["linear_velocity"], _linear(batch))
 
 
 def _wheels(batch: Batch) -> Arguments:
@@ -83,7 +126,7 @@ def _wheels(batch: Batch) -> Arguments:
     values = np.zeros((len(messages), 3))
     values[:, 0] = messages["linear_velocity"][:, 0]
     values[:, 1] = messages["angular_velocity"][:, 2]
-    covariance = messages["twist_covariance"].reshape(-1, 6, 6)[:, [0, 0, 5, 5], [0, 5, 0, 5]]
+    covariance = _twist_covariances(batch)[:, [0, 0, 5, 5], [0, 5, 0, 5]]
     return _vectors(batch, values, _padded(covariance))
 
 
@@ -109,15 +152,42 @@ def _pressures(batch: Batch) -> Arguments:
 
 
 FIX = "sensor_msgs/msg/NavSatFix"
+ODOMETRY = "nav_msgs/msg/Odometry"
 TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
+BARE_TWIST = "geometry_msgs/msg/TwistStamped"
 
 INPUTS = (
-    Input("gnss_fix", Stream.GNSS_POSITION, FIX, _fixes, is_gnss=True),
-    Input("gnss_velocity", Stream.GNSS_VELOCITY, TWIST, _gnss_velocities, is_gnss=True),
-    Input("heading", Stream.HEADING, "sensor_msgs/msg/Imu", _headings, is_gnss=True),
+    Input(
+        "gnss_fix",
+        Stream.GNSS_POSITION,
+        FIX,
+        _fixes,
+        push="push_gnss_position",
+        is_gnss=True,
+        by_receiver=True,
+        depth=50,
+    ),
+    Input(
+        "gnss_velocity",
+        Stream.GNSS_VELOCITY,
+        TWIST,
+        _gnss_velocities,
+        ((BARE_TWIST, _gnss_velocities),),
+        push="push_gnss_velocity",
+        is_gnss=True,
+        by_receiver=True,
+        depth=50,
+    ),
+    Input("heading", Stream.HEADING, "sensor_msgs/msg/Imu", _headings, is_gnss=True, depth=50),
     Input("mag", Stream.MAG, "sensor_msgs/msg/MagneticField", _mags),
-    Input("wheel", Stream.WHEEL, "nav_msgs/msg/Odometry", _wheels),
-    Input("body_velocity", Stream.BODY_VELOCITY, TWIST, _body_velocities),
+    Input("wheel", Stream.WHEEL, ODOMETRY, _wheels, ((TWIST, _wheels), (BARE_TWIST, _wheels))),
+    Input(
+        "body_velocity",
+        Stream.BODY_VELOCITY,
+        TWIST,
+        _body_velocities,
+        ((BARE_TWIST, _body_velocities), (ODOMETRY, _body_velocities)),
+    ),
     Input("baro", Stream.BARO, "sensor_msgs/msg/FluidPressure", _pressures),
 )
 """All but the IMU. The order is that of messages with one log time."""
