@@ -471,7 +471,7 @@ def distrusting(robots: int, std: float, speed: float = 0.0) -> int:
             latitude = math.radians(DATUM[0]) + (north + speed * seconds) / 6.378e6
             longitude = math.radians(DATUM[1]) + east / (6.378e6 * math.cos(latitude))
             aid["stamp"] = round(seconds * 1e9)
-            aid["payload"] = (latitude, longitude, DATUM[2] + up, std**2, 0.0, 0.0, std**2, 0.0, std**2)
+            aid["payload"][:9] = (latitude, longitude, DATUM[2] + up, std**2, 0.0, 0.0, std**2, 0.0, std**2)
             alignment.note_position(state, aid, settings)
             if state["motion_stamp"] > 0 and state["still_stamp"] == NEVER:
                 found += 1

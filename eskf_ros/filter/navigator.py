@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
-from eskf_ros.filter.aiding import gnss_position, gnss_velocity
+from eskf_ros.filter.aiding import gnss_position, gnss_velocity, heading
 from eskf_ros.filter.alignment import (
     heading_of,
     move_datum,
@@ -25,7 +25,8 @@ from eskf_ros.filter.alignment import (
     start_position,
     watch_stillness,
 )
-from eskf_ros.filter.door import admit
+from eskf_ros.filter.door import ABSENT, admit
+from eskf_ros.filter.heading_hints import is_heading_told
 from eskf_ros.filter.layout import (
     AID,
     CONSTRAINTS,
@@ -44,7 +45,7 @@ from eskf_ros.filter.layout import (
     blank_state,
 )
 from eskf_ros.filter.local import carry, measure_step, note_jump
-from eskf_ros.filter.monitors import complaints
+from eskf_ros.filter.monitors import complaints, watch_course, watch_heading
 from eskf_ros.filter.optional import join
 from eskf_ros.filter.output import status_of, write_odometry
 from eskf_ros.filter.recovery import is_near_gate, judge_filter, update_weighed_down, watch_solution
@@ -72,6 +73,7 @@ StampArray = npt.NDArray[np.int64]
 
 GNSS_POSITION = int(Stream.GNSS_POSITION)
 GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
+HEADING = int(Stream.HEADING)
 OPEN_DOOR = int(Verdict.WAITING)
 FIRST_CONSTRAINT = int(min(CONSTRAINTS))
 FUSED = int(Verdict.FUSED)
@@ -86,6 +88,8 @@ IMU_BATCH = 1024
 
 HIGHEST_ALTITUDE = 1e5
 """What no receiver on a robot reports (m)."""
+
+DIAGONAL = np.eye(3).ravel()
 
 NO_STAND_IN = (0.0, 0.0, 0.0)
 """The covariance of a message is its own."""
@@ -177,11 +181,12 @@ def fuse(state, aids, i, settings, work):
         note_position(state, aid, settings)
     elif aid.stream == GNSS_VELOCITY:
         note_velocity(state, aid, settings)
+        watch_course(state, aid, heading_of(state, settings), settings)
     if not is_aligned_for(state, aid.stream):
         aid.verdict = BEFORE_ALIGNMENT if aid.stream < FIRST_CONSTRAINT else INACTIVE
         return
     position = (state.position_map[0], state.position_map[1], state.position_map[2])
-    heading = heading_of(state, settings)
+    heading_before = heading_of(state, settings)
     if state.position_known == 0 and aid.stream == GNSS_POSITION:
         start_position(state, aid.payload)
         recall_heading(state, aid.payload, settings)
@@ -192,6 +197,13 @@ def fuse(state, aids, i, settings, work):
     if size == 0:
         aid.verdict = INACTIVE
         return
+    if aid.stream == HEADING:
+        watch_heading(state, aid, work)
+        if state.heading_known == 0:
+            if not is_heading_told(state, aid, settings, work):
+                aid.verdict = BEFORE_ALIGNMENT
+                return
+            size = linearize(state, aid, settings, work)
     gate = settings.gate[aid.stream, size]
     for k in range(size):
         aid.innovation[k] = work.innovation[k]
@@ -204,7 +216,7 @@ def fuse(state, aids, i, settings, work):
         search_heading(state, aid, gate, settings, work)
     if aid.stream == GNSS_POSITION:
         judge_filter(state, aid.verdict)
-    note_jump(state, position, heading, settings)
+    note_jump(state, position, heading_before, settings)
 
 
 @njit
@@ -214,7 +226,7 @@ def is_aligned_for(state, stream):
         return False
     if stream == GNSS_POSITION:
         return True
-    if stream == GNSS_VELOCITY:
+    if stream in (GNSS_VELOCITY, HEADING):
         return state.position_known == 1
     return state.position_known == 1 and state.heading_known == 1
 
@@ -227,6 +239,8 @@ def linearize(state, aid, settings, work):
     """
     if aid.stream == GNSS_POSITION:
         return gnss_position.linearize(state, aid.payload, aid.source, settings, work)
+    if aid.stream == HEADING:
+        return heading.linearize(state, aid.payload, aid.source, settings, work)
     return gnss_velocity.linearize(state, aid.payload, aid.source, settings, work)
 
 
@@ -561,6 +575,8 @@ class Navigator:
         intake = self._intakes[stream]
         matrix = np.ascontiguousarray(covariance, np.float64)
         is_absent = not matrix.any() or (matrix[0] < 0.0 and not intake.may_lack_axes)
+        if intake.largest_variance < math.inf:
+            matrix = np.where((matrix > intake.largest_variance) & (DIAGONAL == 1.0), ABSENT, matrix)
         x, y, z = intake.unknown_std
         stand_in = (x * x, y * y, z * z) if is_absent else NO_STAND_IN
         self._admit(stream, (float(values[0]), float(values[1]), float(values[2])), matrix, stand_in)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.layout import ERROR_CAPACITY
-from eskf_ros.rotation import rotate, rotate_back
+from eskf_ros.filter.layout import ATTITUDE, ERROR_CAPACITY
+from eskf_ros.rotation import rotate, rotate_back, to_matrix
 
 
 @njit
@@ -51,3 +51,28 @@ def set_east_north_up_covariance(noise, state, local_to_ecef, payload, first):
         column = rotate_back(ecef, rotate(local_to_ecef, spread))
         for i in range(3):
             noise[i, j] = column[i]
+
+
+@njit
+def to_local(state, local_to_ecef, direction_body):
+    """Return a direction of the body in the axes whose rotation to ECEF is given (East-North-Up at its place)."""
+    direction_map = rotate(to_matrix(state.attitude), direction_body)
+    return rotate_back(local_to_ecef, rotate(state.map_to_ecef, direction_map))
+
+
+@njit
+def set_attitude_row(jacobian, row, state, local_to_ecef, local):
+    """Write how a small rotation about the local axes (``local``) changes a scalar, in map axes."""
+    in_map = rotate_back(state.map_to_ecef, rotate(local_to_ecef, local))
+    for i in range(3):
+        jacobian[row, ATTITUDE + i] = in_map[i]
+
+
+@njit
+def azimuth_change(direction, level_square):
+    """Return how a small rotation about local axes changes the angle of ``direction`` from east in the level plane.
+
+    theta x d has the angle (d_e (theta x d)_n - d_n (theta x d)_e) / (d_e^2 + d_n^2), the latter is ``level_square``.
+    """
+    slope = -direction[2] / level_square
+    return (slope * direction[0], slope * direction[1], 1.0)
