@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from aided import AidedNavigator, offers, run_aided
-from kernels import Array, copy_of, make_settings, make_state, make_work, random_state, with_error
+from aided import AidedNavigator, run_aided
+from kernels import Array, make_settings, make_state, make_work, random_state, with_error
 from monte_carlo import feed, nees
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -18,7 +18,6 @@ from eskf_ros.bags import Batch, message_dtype
 from eskf_ros.filter.aiding import heading
 from eskf_ros.filter.layout import Status, Stream, Verdict
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.parameters import from_mapping
 from eskf_ros.replay.inputs import INPUTS
 from eskf_ros.simulate.dual_antenna import DualAntenna
 from eskf_ros.simulate.recording import Recording
@@ -284,47 +283,3 @@ def test_good_antennas_are_not_accused() -> None:
         run_through(recording, navigator)
         assert navigator.complaints == []
         assert abs(heading_error(recording, navigator)) < 4.0
-
-
-# -------------------------------------------------------------------------------------------------- arrival order
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_arrival_order_changes_no_bit(seed: int) -> None:
-    """Fixes, headings and IMU samples in any order within the window, from the first sample on."""
-    recording = simulate("drive", 6, imu_rate=25.0, stop=24.0, dual_antenna=DualAntenna(pitch_std_deg=0.5))
-    parameters = from_mapping({**recording.parameters(), "datum": []})
-    random = np.random.default_rng(seed)
-
-    def result(delays: tuple[float, float, float]) -> tuple[bytes, bytes]:
-        messages: list[tuple[int, int, Any]] = []
-        for stamps, delay, kind in (
-            (recording.imu_stamp, delays[0], 0),
-            (recording.fix_stamp, delays[1], 1),
-            ([offer[0] for offer in offers(recording)], delays[2], 2),
-        ):
-            for row, stamp in enumerate(stamps):
-                messages.append((int(stamp) + round(random.uniform(0.0, delay) * SECOND), kind, row))
-        navigator = Navigator(parameters)
-        measured = offers(recording)
-        for _, kind, row in sorted(messages):
-            if kind == 0:
-                part = slice(row, row + 1)
-                arguments = (recording.imu_stamp[part], recording.specific_force[part], recording.angular_rate[part])
-                navigator.push_imu(*arguments)
-            elif kind == 1:
-                place = (recording.fix_latitude_deg, recording.fix_longitude_deg, recording.fix_altitude)
-                covariance = recording.fix_covariance[row]
-                stamp = int(recording.fix_stamp[row])
-                navigator.push_gnss_position(stamp, *(float(v[row]) for v in place), covariance, 2, 0)
-                velocity = recording.velocity_enu[row]
-                navigator.push_gnss_velocity(stamp, velocity, recording.velocity_covariance[row])
-            else:
-                navigator.push(measured[row][1], measured[row][0], measured[row][2], measured[row][3])
-        records = navigator.finish()
-        assert np.count_nonzero(records["verdict"][records["stream"] == Stream.HEADING] == Verdict.FUSED) > 80
-        state = copy_of(navigator.state[0])
-        state["imu_next"] = state["aid_next"] = 0
-        return state.tobytes(), records.tobytes()
-
-    assert result((0.0, 0.0, 0.0)) == result((0.5, 1.9, 1.9))

@@ -23,7 +23,7 @@ ACCEL_BIAS = 9
 GYRO_BIAS = 12
 ERROR_SIZE = 15
 
-OPTIONAL_SIZES = {"position_error": 3}
+OPTIONAL_SIZES = {"position_error": 3, "baro_offset": 1, "baro_scale": 1}
 """Optional errors behind the core, and how many each is: see ``optional``."""
 
 OPTIONAL_CAPACITY = sum(OPTIONAL_SIZES.values())
@@ -202,6 +202,8 @@ STATE = np.dtype(
         ("absolute_interval", "i8"),
         ("rejected_fixes", "i8"),
         ("restarts", "i8"),
+        # When a pressure was last accepted.
+        ("baro_stamp", "i8"),
     ],
     align=True,
 )
@@ -292,6 +294,7 @@ SETTINGS = np.dtype(
         ("imu_position_base", "f8", (3,)),
         ("lever_arms_body", "f8", (SOURCES, 3)),
         ("heading_lines_body", "f8", (SOURCES, 3)),
+        ("baro_arm_body", "f8", (3,)),
         ("correlated_share", "f8"),
         ("gate", "f8", (len(Stream), 4)),
         ("reach", "i8", (len(Stream),)),
@@ -407,7 +410,8 @@ _EVIDENCE = ("still_stamp", "motion_stamp", "last_fix_stamp", "anchor_stamp")
 def blank_state() -> np.ndarray:
     """Return the state before the first IMU sample."""
     state = allocate(STATE)
-    for field in ("stamp", "imu_stamp", "first_stamp", "window_start", "absolute_stamp", *_EVIDENCE):
+    stamps = ("stamp", "imu_stamp", "first_stamp", "window_start", "absolute_stamp", "baro_stamp")
+    for field in (*stamps, *_EVIDENCE):
         state[field] = NEVER
     state["attitude"][0, 0] = 1.0
     state["error_size"] = ERROR_SIZE

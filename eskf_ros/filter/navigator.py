@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
-from eskf_ros.filter.aiding import gnss_position, gnss_velocity, heading
+from eskf_ros.filter.aiding import baro, gnss_position, gnss_velocity, heading
 from eskf_ros.filter.alignment import (
     heading_of,
     move_datum,
@@ -48,7 +48,13 @@ from eskf_ros.filter.local import carry, measure_step, note_jump
 from eskf_ros.filter.monitors import complaints, watch_course, watch_heading
 from eskf_ros.filter.optional import join
 from eskf_ros.filter.output import status_of, write_odometry
-from eskf_ros.filter.recovery import is_near_gate, judge_filter, update_weighed_down, watch_solution
+from eskf_ros.filter.recovery import (
+    is_near_gate,
+    judge_filter,
+    judge_pressure,
+    update_weighed_down,
+    watch_solution,
+)
 from eskf_ros.filter.settings import intakes_from, settings_from
 from eskf_ros.filter.strapdown import SECOND, propagate
 from eskf_ros.filter.timeline import (
@@ -74,6 +80,7 @@ StampArray = npt.NDArray[np.int64]
 GNSS_POSITION = int(Stream.GNSS_POSITION)
 GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
 HEADING = int(Stream.HEADING)
+BARO = int(Stream.BARO)
 OPEN_DOOR = int(Verdict.WAITING)
 FIRST_CONSTRAINT = int(min(CONSTRAINTS))
 FUSED = int(Verdict.FUSED)
@@ -216,6 +223,8 @@ def fuse(state, aids, i, settings, work):
         search_heading(state, aid, gate, settings, work)
     if aid.stream == GNSS_POSITION:
         judge_filter(state, aid.verdict)
+    if aid.stream == BARO:
+        judge_pressure(state, aid.verdict, settings)
     note_jump(state, position, heading_before, settings)
 
 
@@ -226,7 +235,7 @@ def is_aligned_for(state, stream):
         return False
     if stream == GNSS_POSITION:
         return True
-    if stream in (GNSS_VELOCITY, HEADING):
+    if stream in (GNSS_VELOCITY, HEADING, BARO):
         return state.position_known == 1
     return state.position_known == 1 and state.heading_known == 1
 
@@ -241,6 +250,8 @@ def linearize(state, aid, settings, work):
         return gnss_position.linearize(state, aid.payload, aid.source, settings, work)
     if aid.stream == HEADING:
         return heading.linearize(state, aid.payload, aid.source, settings, work)
+    if aid.stream == BARO:
+        return baro.linearize(state, aid.payload, aid.source, settings, work)
     return gnss_velocity.linearize(state, aid.payload, aid.source, settings, work)
 
 
@@ -595,7 +606,7 @@ class Navigator:
         aid = self._offered[0]
         if not intake.is_used:
             aid["door"] = Verdict.DISABLED
-        elif aid["door"] == Verdict.WAITING and max(map(abs, values)) > intake.largest:
+        elif aid["door"] == Verdict.WAITING and (max(map(abs, values)) > intake.largest or values[0] < intake.lowest):
             aid["door"] = Verdict.BAD_VALUE
         if aid["door"] == Verdict.WAITING and stand_in is not NO_STAND_IN:
             self._stand_ins += 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,9 @@ STRONGEST_FIELD = 1.0
 HIGHEST_PRESSURE = 1.2e5
 """What no sensor on a robot reports (m/s, T, Pa)."""
 
+LOWEST_PRESSURE = 1.0e4
+"""That at 16 km (Pa); a driver that reports hectopascal is below it."""
+
 LARGEST_ANGLE = 2.0 * math.pi
 UNKNOWN_ANGLE_VARIANCE = 1.0
 """Angles are in rad; drivers say with a variance like 1000 or pi^2 that they do not know one (rad2)."""
@@ -35,7 +38,7 @@ class Intake:
 
     ``std_floor`` and ``unknown_std`` per axis, in the unit of the values; the latter stands in for a covariance that is
     not there. No message with a value beyond ``largest`` can be true. ``may_lack_axes``: a negative variance, or one
-    above ``largest_variance``, says that the axis was not measured.
+    above ``largest_variance``, says that the axis was not measured. The first value is never below ``lowest``.
     """
 
     is_used: bool
@@ -46,6 +49,7 @@ class Intake:
     largest: float
     may_lack_axes: bool = False
     largest_variance: float = math.inf
+    lowest: float = -math.inf
 
 
 def _threefold(value: float) -> Axes:
@@ -108,7 +112,10 @@ def intakes_from(parameters: Parameters) -> dict[Stream, Intake]:
         Stream.MAG: aid(mag, _threefold(mag.std_floor), _threefold(mag.unknown_std), STRONGEST_FIELD, False),
         Stream.WHEEL: aid(wheel, *wheel_std, HIGHEST_SPEED, True),
         Stream.BODY_VELOCITY: aid(body, _threefold(body.std_floor), _threefold(body.unknown_std), HIGHEST_SPEED, True),
-        Stream.BARO: aid(baro, _threefold(baro.std_floor), _threefold(baro.unknown_std), HIGHEST_PRESSURE, True),
+        Stream.BARO: replace(
+            aid(baro, _threefold(baro.std_floor), _threefold(baro.unknown_std), HIGHEST_PRESSURE, True),
+            lowest=LOWEST_PRESSURE,
+        ),
     }
 
 
@@ -149,6 +156,7 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
     settings["lever_arms_body"] = lever_arms_base @ imu_to_base
     baseline = _matrix(parameters.heading.mount_rpy_deg)[:, 0]
     settings["heading_lines_body"] = np.array([baseline, (1.0, 0.0, 0.0)]) @ imu_to_base
+    settings["baro_arm_body"] = np.subtract(parameters.baro.position, imu.mount_position) @ imu_to_base
     for stream, probability in gate_probabilities(parameters).items():
         settings["gate"][0, stream, 1:] = chdtri([1, 2, 3], 1.0 - probability)
     settings["constrains"][0, Stream.ZUPT] = settings["constrains"][0, Stream.ZARU] = parameters.zupt.enabled
@@ -174,10 +182,13 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
 def place_optional_states(settings: np.void, parameters: Parameters) -> None:
     """Give the optional states that are switched on their places and their models, and the streams their reach."""
     settings["reach"] = end = ERROR_SIZE
-    time = parameters.gnss.correlation_time
+    time, baro = parameters.gnss.correlation_time, parameters.baro
     # Name, whether it is on, first deviation, driving noise, correlation time (0: random walk), streams that need it.
     blocks: tuple[tuple[str, bool, float, float, float, tuple[Stream, ...]], ...] = (
         ("position_error", time > 0.0, 1.0, math.sqrt(2.0 / time) if time else 0.0, time, (Stream.GNSS_POSITION,)),
+        # Not by whether it is used, which may change while running: places stay.
+        ("baro_offset", True, baro.offset_std, baro.offset_random_walk, 0.0, (Stream.BARO,)),
+        ("baro_scale", True, baro.scale_std, 0.0, 0.0, (Stream.BARO,)),
     )
     for name, is_on, std, noise_density, time, streams in blocks:
         settings[f"{name}_at"] = end if is_on else NOWHERE
