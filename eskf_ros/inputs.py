@@ -11,6 +11,7 @@ entry in ``others`` and a choice of the parameter ``topics.NAME_type``.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
@@ -104,7 +105,7 @@ def _vectors(batch: Batch, values: NDArray[Any], covariances: NDArray[Any]) -> A
 
 
 def _headings(batch: Batch) -> Arguments:
-    """Yaw (0 = east, counter-clockwise) and pitch (down is positive) of an orientation."""
+    """Yaw (0 = east, counter-clockwise) and pitch (down is positive) of an orientation, if there is one (REP-145)."""
     messages = batch.messages
     x, y, z, w = messages["orientation"].T
     values, covariances = np.zeros((len(messages), 3)), np.zeros((len(messages), 9))
@@ -113,6 +114,8 @@ def _headings(batch: Batch) -> Arguments:
     given = messages["orientation_covariance"]
     covariances[:, 0], covariances[:, 4] = given[:, 8], given[:, 4]
     covariances[given.any(axis=1), 8] = UNMEASURED
+    covariances[given[:, 0] == UNMEASURED] = UNMEASURED
+    values[np.abs(x * x + y * y + z * z + w * w - 1.0) > 0.1] = math.nan
     return _vectors(batch, values, covariances)
 
 

@@ -112,7 +112,11 @@ class Topics:
         "geometry_msgs/msg/TwistWithCovarianceStamped", _TYPE, "geometry_msgs/msg/TwistStamped"
     )
     heading: str = _parameter(
-        "gnss/heading", "", "sensor_msgs/Imu: yaw of a dual-antenna receiver, with its covariance.", **_TOPIC
+        "gnss/heading",
+        "",
+        "sensor_msgs/Imu of a dual-antenna receiver: yaw (0 = east, counter-clockwise) and pitch of the baseline; one "
+        "whose variance is above 1 rad2 is not used.",
+        **_TOPIC,
     )
     mag: str = _parameter("imu/mag", "", "sensor_msgs/MagneticField: magnetometer in the frame of the IMU.", **_TOPIC)
     wheel: str = _parameter(
@@ -382,6 +386,16 @@ class Aid:
 
 @dataclass(frozen=True)
 class Heading(Aid):
+    mount_rpy_deg: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0),
+        "deg",
+        "Orientation of the baseline in base_link, whose yaw and pitch the messages tell: roll, pitch, yaw about fixed "
+        "axes as in a URDF, of a frame whose x axis leads from the first antenna (of u-blox: the moving base) to the "
+        "second. [0.0, 0.0, 0.0]: the second is in front; [0.0, 0.0, 90.0]: it is on the left; [0.0, 0.0, 180.0]: it "
+        "is behind.",
+        minimum=-360.0,
+        maximum=360.0,
+    )
     std_floor_deg: float = _parameter(
         0.2, "deg", "The standard deviation is never taken smaller than this.", above=0.0, maximum=90.0, live=True
     )
@@ -477,6 +491,37 @@ class BodyVelocity(Aid):
 
 @dataclass(frozen=True)
 class Baro(Aid):
+    position: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0),
+        "m",
+        "Position of the barometer in base_link, x forward, y left, z up.",
+        minimum=-1000.0,
+        maximum=1000.0,
+    )
+    offset_std: float = _parameter(
+        300.0,
+        "m",
+        "Standard deviation at first of the difference between pressure altitude and height: weather and geoid. "
+        "It is estimated.",
+        above=0.0,
+        maximum=1.0e4,
+    )
+    offset_random_walk: float = _parameter(
+        0.1,
+        "m/s/rtHz",
+        "How fast that difference wanders, by weather, wind and warming up: by this value times the square root of the "
+        "seconds passed. The default is 6 m in one hour; more where air is blown about, as in a vehicle.",
+        minimum=0.0,
+        maximum=100.0,
+    )
+    scale_std: float = _parameter(
+        0.03,
+        "",
+        "Standard deviation of the factor by which pressure altitude grows faster or slower than height: 0.03 where "
+        "the air is 9 K warmer or colder than in the standard atmosphere. It is estimated.",
+        minimum=0.0,
+        maximum=1.0,
+    )
     std_floor: float = _parameter(
         3.0, "Pa", "The standard deviation is never taken smaller than this.", above=0.0, maximum=1.0e4, live=True
     )

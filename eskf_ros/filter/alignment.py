@@ -179,6 +179,7 @@ def restart(state):
     """Start the alignment again; only the datum stays."""
     state.restarts += 1
     forget_search(state)
+    state.hint_count = 0
     state.rejected_fixes = 0
     state.level_known = 0
     state.position_known = 0

@@ -23,7 +23,7 @@ ACCEL_BIAS = 9
 GYRO_BIAS = 12
 ERROR_SIZE = 15
 
-OPTIONAL_SIZES = {"position_error": 3, "mounting": 2, "wheel_scale": 1}
+OPTIONAL_SIZES = {"position_error": 3, "mounting": 2, "wheel_scale": 1, "baro_offset": 1, "baro_scale": 1}
 """Optional errors behind the core, and how many each is: see ``optional``."""
 
 OPTIONAL_CAPACITY = sum(OPTIONAL_SIZES.values())
@@ -166,6 +166,14 @@ STATE = np.dtype(
         ("search_tilt_variance", "f8"),
         ("search_age", "f8"),
         ("search_turn", "f8"),
+        # What a sensor says of the unknown heading: its rank, how often it agreed with itself since when, the last
+        # message, by how much (rad) it would turn the attitude, and its standard deviation.
+        ("hint_rank", "i8"),
+        ("hint_count", "i8"),
+        ("hint_since", "i8"),
+        ("hint_stamp", "i8"),
+        ("hint_turn", "f8"),
+        ("hint_std", "f8"),
         # External evidence of motion: when GNSS last proved it, the last fix, and the one the window started from.
         ("motion_stamp", "i8"),
         ("last_fix_stamp", "i8"),
@@ -199,11 +207,17 @@ STATE = np.dtype(
         ("tilted_windows", "i8"),
         ("tilted_force", "f8", (3,)),
         ("fast_windows", "i8"),
+        # Monitors of the heading: sums of cosine and sine, and how many. Messages of the dual antenna against the
+        # estimate; course over ground against the estimate.
+        ("heading_contrast", "f8", (3,)),
+        ("course_contrast", "f8", (3,)),
         # When absolute aids were last accepted, how many were rejected since, and how often that ended in a restart.
         ("absolute_stamp", "i8"),
         ("absolute_interval", "i8"),
         ("rejected_fixes", "i8"),
         ("restarts", "i8"),
+        # When a pressure was last accepted.
+        ("baro_stamp", "i8"),
     ],
     align=True,
 )
@@ -293,6 +307,8 @@ SETTINGS = np.dtype(
         ("imu_to_base", "f8", (3, 3)),
         ("imu_position_base", "f8", (3,)),
         ("lever_arms_body", "f8", (SOURCES, 3)),
+        ("heading_lines_body", "f8", (SOURCES, 3)),
+        ("baro_arm_body", "f8", (3,)),
         ("correlated_share", "f8"),
         ("wheel_arm_body", "f8", (3,)),
         ("wheel_slip", "f8"),
@@ -415,7 +431,8 @@ _EVIDENCE = ("still_stamp", "motion_stamp", "last_fix_stamp", "anchor_stamp", "b
 def blank_state() -> np.ndarray:
     """Return the state before the first IMU sample."""
     state = allocate(STATE)
-    for field in ("stamp", "imu_stamp", "first_stamp", "window_start", "absolute_stamp", *_EVIDENCE):
+    stamps = ("stamp", "imu_stamp", "first_stamp", "window_start", "absolute_stamp", "baro_stamp")
+    for field in (*stamps, *_EVIDENCE):
         state[field] = NEVER
     state["attitude"][0, 0] = 1.0
     state["error_size"] = ERROR_SIZE
