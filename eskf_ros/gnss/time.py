@@ -73,6 +73,11 @@ def leap_seconds(year: int, month: int, day: int) -> int:
     return bisect_right(_LEAP_DAYS, datetime.date(year, month, day).toordinal())
 
 
+def date_of(week: int, seconds: float) -> datetime.date:
+    """Return the date of an instant. Raises ValueError or OverflowError outside of the years 1 to 9999."""
+    return datetime.date.fromordinal(_FIRST_DAY + 7 * week + int(seconds // SECONDS_PER_DAY))
+
+
 def week_near(seconds: float, near: Instant) -> int:
     """Return the week in which ``seconds`` of week are closest to the instant ``near``, at most half a week away.
 
