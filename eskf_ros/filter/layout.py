@@ -14,6 +14,7 @@ from enum import IntEnum
 import numpy as np
 
 from eskf_ros.compiled import COMPILED
+from eskf_ros.gnss.signals import BEIDOU_3, Gnss
 
 # Error state: first index of each block of three. These 15 are the core; every robot has them.
 POSITION = 0
@@ -23,8 +24,15 @@ ACCEL_BIAS = 9
 GYRO_BIAS = 12
 ERROR_SIZE = 15
 
-OPTIONAL_SIZES = {"position_error": 3}
-"""Optional errors behind the core, and how many each is: see ``optional``."""
+OPTIONAL_SIZES = {"position_error": 3, "clock": 2, "inter_system": 6}
+"""Optional errors behind the core, and how many each is: see ``optional``.
+
+``clock``: of the receiver, bias (m) and drift (m/s). ``inter_system``: by what the ranges of a constellation are longer
+than those of GPS (m), in the order of `INTER_SYSTEM`.
+"""
+
+INTER_SYSTEM = (Gnss.GALILEO, BEIDOU_3, Gnss.GLONASS, Gnss.QZSS, Gnss.BEIDOU, Gnss.SBAS)
+"""The constellations but GPS (`gnss.signals.time_group`), the most usual first: a state joins with those before it."""
 
 OPTIONAL_CAPACITY = sum(OPTIONAL_SIZES.values())
 ERROR_CAPACITY = ERROR_SIZE + OPTIONAL_CAPACITY
@@ -80,6 +88,7 @@ class Verdict(IntEnum):
     DISABLED = 11
     WEIGHED_DOWN = 12
     INACTIVE = 13
+    LOW_ELEVATION = 14
 
 
 class Stream(IntEnum):
@@ -190,6 +199,11 @@ STATE = np.dtype(
         ("absolute_interval", "i8"),
         ("rejected_fixes", "i8"),
         ("restarts", "i8"),
+        # Tight coupling: whether the errors of clock bias and drift have values yet, milliseconds it has jumped by,
+        # and how often most of the satellites contradicted the state.
+        ("clock_known", "i8", (2,)),
+        ("clock_jumps", "i8"),
+        ("range_faults", "i8"),
     ],
     align=True,
 )
@@ -280,6 +294,12 @@ SETTINGS = np.dtype(
         ("imu_position_base", "f8", (3,)),
         ("lever_arms_body", "f8", (SOURCES, 3)),
         ("correlated_share", "f8"),
+        # Ranges: lowest elevation (rad), factor on variances, floors (m, m/s), Klobuchar parameters (NaN: none).
+        ("elevation_mask", "f8"),
+        ("range_covariance_scale", "f8"),
+        ("code_std_floor", "f8"),
+        ("range_rate_std_floor", "f8"),
+        ("klobuchar", "f8", (8,)),
         ("gate", "f8", (len(Stream), 4)),
         ("reach", "i8", (len(Stream),)),
         ("constrains", "i8", (len(Stream),)),
