@@ -354,6 +354,9 @@ LOCAL = np.dtype(
 )
 """Pose of the IMU in `odom` (m, rad) and the variances it has gathered since the start (per axis)."""
 
+LARGEST_EPOCH = 256
+"""So many signals of an epoch are looked at together."""
+
 WORK = np.dtype(
     [
         ("half", "f8", (ACCEL_BIAS, ERROR_SIZE)),
@@ -366,6 +369,19 @@ WORK = np.dtype(
         ("gain", "f8", (ERROR_CAPACITY, 3)),
         ("residual_gain", "f8", (ERROR_CAPACITY, 3)),
         ("correction", "f8", (ERROR_CAPACITY,)),
+        # The signals of one epoch, and their least squares (see ``ranges``).
+        ("signal_count", "i8"),
+        ("signal_index", "i8", (LARGEST_EPOCH,)),
+        ("signal_innovation", "f8", (LARGEST_EPOCH,)),
+        ("signal_spread", "f8", (LARGEST_EPOCH,)),
+        ("signal_noise", "f8", (LARGEST_EPOCH,)),
+        ("signal_direction", "f8", (LARGEST_EPOCH, 3)),
+        ("signal_weight", "f8", (LARGEST_EPOCH,)),
+        ("signal_residual", "f8", (LARGEST_EPOCH,)),
+        ("sorted", "f8", (LARGEST_EPOCH,)),
+        ("normal", "f8", (4, 4)),
+        ("right", "f8", (4,)),
+        ("step", "f8", (4,)),
     ],
     align=True,
 )

@@ -47,6 +47,7 @@ from eskf_ros.filter.local import carry, measure_step, note_jump
 from eskf_ros.filter.monitors import complaints
 from eskf_ros.filter.optional import join
 from eskf_ros.filter.output import status_of, write_odometry
+from eskf_ros.filter.ranges import end_of_epoch, fuse_ranges, is_range, offer_signals
 from eskf_ros.filter.recovery import is_near_gate, judge_filter, update_weighed_down, watch_solution
 from eskf_ros.filter.settings import intakes_from, settings_from
 from eskf_ros.filter.strapdown import SECOND, propagate
@@ -56,7 +57,7 @@ from eskf_ros.filter.timeline import (
     forget,
     insert_aid,
     insert_imu,
-    is_duplicate,
+    open_record,
     raise_barrier,
     rewind,
     save_checkpoint,
@@ -64,6 +65,10 @@ from eskf_ros.filter.timeline import (
 )
 from eskf_ros.filter.update import update
 from eskf_ros.filter.warm_start import Memory, recall
+from eskf_ros.gnss.range_model import NO_KLOBUCHAR
+from eskf_ros.gnss.ranges import Status as RangeStatus
+from eskf_ros.gnss.ranges import status_counts
+from eskf_ros.gnss.time import SECONDS_PER_WEEK, Instant
 from eskf_ros.parameters import Parameters
 from eskf_ros.rotation import to_matrix
 
@@ -72,10 +77,8 @@ StampArray = npt.NDArray[np.int64]
 
 GNSS_POSITION = int(Stream.GNSS_POSITION)
 GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
-OPEN_DOOR = int(Verdict.WAITING)
 FIRST_CONSTRAINT = int(min(CONSTRAINTS))
 FUSED = int(Verdict.FUSED)
-DUPLICATE = int(Verdict.DUPLICATE)
 BEFORE_ALIGNMENT = int(Verdict.BEFORE_ALIGNMENT)
 INACTIVE = int(Verdict.INACTIVE)
 
@@ -106,8 +109,7 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
 
         while state.aid_next < t.aid_count and aids[state.aid_next].stamp < sample.stamp:
             predict(state, aids[state.aid_next].stamp, sample, settings, work)
-            fuse(state, aids, state.aid_next, settings, work)
-            state.aid_next += 1
+            state.aid_next = fuse_next(state, aids, t.aid_count, settings, work)
 
         previous_stamp = state.imu_stamp
         predict(state, sample.stamp, sample, settings, work)
@@ -121,8 +123,7 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
             carry(local, state, settings)
 
         while state.aid_next < t.aid_count and aids[state.aid_next].stamp == sample.stamp:
-            fuse(state, aids, state.aid_next, settings, work)
-            state.aid_next += 1
+            state.aid_next = fuse_next(state, aids, t.aid_count, settings, work)
 
         if is_new and is_on_grid(previous_stamp, sample.stamp, settings.output_interval):
             write_odometry(state, local, settings, rows[row_count])
@@ -160,19 +161,23 @@ def take_sample(state, sample):
 
 
 @njit
+def fuse_next(state, aids, count, settings, work):
+    """Offer the next of ``count`` measurements, signals by the epoch; return the index of the one that follows."""
+    i = state.aid_next
+    if not is_range(aids[i].stream):
+        fuse(state, aids, i, settings, work)
+        return i + 1
+    end = end_of_epoch(aids, i, count)
+    fuse_ranges(state, aids, i, end, settings, work)
+    return end
+
+
+@njit
 def fuse(state, aids, i, settings, work):
     """Offer one measurement to the state and leave the verdict in its record."""
+    if not open_record(aids, i):
+        return
     aid = aids[i]
-    aid.verdict = aid.door
-    aid.nis = np.nan
-    aid.dof = 0
-    for k in range(3):
-        aid.innovation[k] = np.nan
-    if aid.door != OPEN_DOOR:
-        return
-    if is_duplicate(aids, i):
-        aid.verdict = DUPLICATE
-        return
     if aid.stream == GNSS_POSITION:
         note_position(state, aid, settings)
     elif aid.stream == GNSS_VELOCITY:
@@ -253,6 +258,7 @@ class Navigator:
         self._rows = allocate(ODOMETRY, len(self._imu))
         self._offered = allocate(AID)
         self._memory: tuple[Memory, float] | None = None
+        self._klobuchar = NO_KLOBUCHAR
         self.configure(parameters)
         self.reset()
 
@@ -260,6 +266,7 @@ class Navigator:
         """Use other parameters from now on; history within the window is judged by them when it is applied again."""
         self.parameters = parameters
         self._settings = settings_from(parameters, self._output_rate)
+        self._settings["klobuchar"] = self._klobuchar
         self._intakes = intakes_from(parameters)
         if self._memory is not None:
             recall(*self._memory, parameters, self._settings[0])
@@ -282,6 +289,8 @@ class Navigator:
         self._refused_count: Counter[Stream] = Counter()
         self._stamp_difference: dict[Stream, float] = {}
         self._stand_ins = 0
+        self.range_statuses: Counter[RangeStatus] = Counter()
+        """What became of the signals before they entered the timeline: how many are usable, and why others are not."""
 
     def warm_start(self, memory: Memory, age: float) -> None:
         """Offer what an earlier run knew, ``age`` seconds ago; to be called before the first sample."""
@@ -444,6 +453,43 @@ class Navigator:
         self._take(stream, values, covariance)
         self._push_aid(stream, stamp + round(self._intakes[stream].time_offset * SECOND), arrival)
 
+    def push_ranges(self, stamp: int, instant: Instant, signals: np.ndarray, arrival: int = 0) -> None:
+        """Take the signals (MEASURED_SIGNAL, `gnss.measurements.measured_epoch`) of one epoch of the first receiver.
+
+        ``stamp``: the instant of the measurement on the IMU's clock; ``instant``: the same in GPS time, to a minute.
+        The signals have been measured without a position, so that they do not depend on when they come.
+        """
+        self.range_statuses.update(status_counts(signals))
+        is_tight, ranges = self.parameters.mode == "tight", self.parameters.ranges
+        code_door = Verdict.WAITING if is_tight and ranges.use else Verdict.DISABLED
+        rate_door = Verdict.WAITING if is_tight and ranges.use_doppler else Verdict.DISABLED
+        stamp += round(ranges.time_offset * SECOND)
+        self._make_room(2 * len(signals))
+        refused = np.zeros(2 * len(signals), RECORD)
+        count = offer_signals(
+            self._aids,
+            self._timeline,
+            self._offered,
+            signals,
+            stamp,
+            arrival,
+            instant[0] * SECONDS_PER_WEEK + instant[1],
+            int(code_door),
+            int(rate_door),
+            refused,
+        )
+        for stream in (Stream.PSEUDORANGE, Stream.RANGE_RATE):
+            self._offered_count[stream] += 1
+            if (refused["stream"][:count] == stream).any():
+                self._note_refused(stream, stamp)
+        if count:
+            self._refused.append(refused[:count])
+
+    def set_ionosphere(self, klobuchar: Sequence[float] | FloatArray) -> None:
+        """Take the eight parameters of Klobuchar's model (alpha, beta), before the first ranges."""
+        self._klobuchar = np.array(klobuchar, np.float64)
+        self._settings["klobuchar"] = self._klobuchar
+
     def take_records(self) -> np.ndarray:
         """Return the records (RECORD) that became final since the last call: in the total order, the too late last."""
         return self._take_records(False)
@@ -590,6 +636,9 @@ class Navigator:
         second = self.parameters.second_gnss
         is_second = second.frame_id != "" and frame_id == second.frame_id
         offset = second.time_offset if is_second else self.parameters.gnss.time_offset
+        if self.parameters.mode == "tight" and not is_second:
+            # The fix is made of the same ranges: both together would count twice.
+            self._offered[0]["door"] = Verdict.DISABLED
         self._push_aid(stream, stamp + round(offset * SECOND), arrival, int(is_second))
 
     def _push_aid(self, stream: Stream, stamp: int, arrival: int, source: int = 0) -> None:
@@ -605,12 +654,15 @@ class Navigator:
 
     def _refuse(self, stream: Stream, stamp: int, arrival: int, source: int, verdict: Verdict) -> None:
         """Record a measurement that never enters the timeline."""
+        self._note_refused(stream, stamp)
+        record = (stamp, arrival, stream, source, verdict, 0, math.nan, (math.nan,) * 3)
+        self._refused.append(np.array([record], RECORD))
+
+    def _note_refused(self, stream: Stream, stamp: int) -> None:
         frontier = int(self._timeline["frontier"][0])
         if frontier != NEVER:
             self._refused_count[stream] += 1
             self._stamp_difference[stream] = (stamp - frontier) / SECOND
-        record = (stamp, arrival, stream, source, verdict, 0, math.nan, (math.nan,) * 3)
-        self._refused.append(np.array([record], RECORD))
 
     def _take_records(self, everything: bool) -> np.ndarray:
         records = allocate(RECORD, max(1, int(self._timeline["aid_count"][0] - self._timeline["recorded"][0])))
@@ -623,12 +675,12 @@ class Navigator:
         self.update()
         forget(self._states, self._imu, self._aids, self._checkpoints, self._timeline)
 
-    def _make_room(self) -> None:
-        """See that one batch of IMU samples with its checkpoints, and one aid, fit into the buffers."""
+    def _make_room(self, aids: int = 1) -> None:
+        """See that one batch of IMU samples with its checkpoints, and so many aids, fit into the buffers."""
         timeline = self._timeline
         checkpoints_needed = IMU_BATCH // CHECKPOINT_SPACING + 2
         # An interval between two samples has room for one grid point of the constraints.
-        aids_needed = 2 + IMU_BATCH * int(self._settings["constrains"].sum())
+        aids_needed = 1 + aids + IMU_BATCH * int(self._settings["constrains"].sum())
         if (
             len(self._imu) >= timeline["imu_count"][0] + IMU_BATCH
             and len(self._aids) >= timeline["aid_count"][0] + aids_needed
