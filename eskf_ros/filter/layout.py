@@ -378,6 +378,7 @@ WORK = np.dtype(
         ("signal_direction", "f8", (LARGEST_EPOCH, 3)),
         ("signal_weight", "f8", (LARGEST_EPOCH,)),
         ("signal_residual", "f8", (LARGEST_EPOCH,)),
+        ("signal_square", "f8", (LARGEST_EPOCH,)),
         ("sorted", "f8", (LARGEST_EPOCH,)),
         ("normal", "f8", (4, 4)),
         ("right", "f8", (4,)),

@@ -65,6 +65,7 @@ from eskf_ros.filter.timeline import (
 )
 from eskf_ros.filter.update import update
 from eskf_ros.filter.warm_start import Memory, recall
+from eskf_ros.gnss.measurements import MEASURED_SIGNAL
 from eskf_ros.gnss.range_model import NO_KLOBUCHAR
 from eskf_ros.gnss.ranges import Status as RangeStatus
 from eskf_ros.gnss.ranges import status_counts
@@ -704,6 +705,7 @@ def compile_kernels() -> None:
     trial.push_imu(np.array([stamp]), np.array([[0.0, 0.0, 9.8]]), np.zeros((1, 3)))
     trial.push_gnss_position(stamp, *point, unit, 2, 0)
     trial.push_gnss_velocity(stamp, point, unit)
+    trial.push_ranges(stamp, (0, 0.0), np.zeros(1, MEASURED_SIGNAL))
     trial.take_records()
     trial.odometry  # noqa: B018 - asked for its side effect
     trial.status  # noqa: B018

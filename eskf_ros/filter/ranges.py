@@ -356,8 +356,8 @@ def judge_majority(state, aids, first, end, which, settings, work):
     elif count >= FEWEST_TO_JUDGE:
         state.range_faults += 1
         for k in range(count):
-            work.signal_weight[k] = work.signal_innovation[k] ** 2
-        fault = median(work.signal_weight, count, work) / MEDIAN_OF_SQUARES
+            work.signal_square[k] = work.signal_innovation[k] ** 2
+        fault = median(work.signal_square, count, work) / MEDIAN_OF_SQUARES
         block = POSITION if which == 0 else VELOCITY
         for i in range(3):
             state.covariance[block + i, block + i] += fault
@@ -379,9 +379,7 @@ def exclude_outliers(aids, work):
     count = work.signal_count
     if count < FEWEST_TO_EXCLUDE:
         return
-    for k in range(count):
-        work.signal_weight[k] = work.signal_residual[k] ** 2
-    scale = max(1.0, median(work.signal_weight, count, work) / MEDIAN_OF_SQUARES * count / (count - FEWEST_TO_SOLVE))
+    scale = variance_factor(work)
     for k in range(count):
         square = work.signal_residual[k] ** 2
         if square > OUTLIER**2 * scale:
@@ -396,16 +394,17 @@ def exclude_outliers(aids, work):
 def solve_epoch(work):
     """Solve the gathered signals for a step of position or velocity and of the clock; say whether they suffice.
 
-    Least squares with Huber's weights, iterated from equal ones: the sum it minimises is convex. Step to
-    ``work.step``, covariance to ``work.normal`` (grown where residuals are larger than the noise says), residuals in
+    Least squares with Huber's weights, iterated; the sum it minimises is convex: where it begins does not matter. Step
+    to ``work.step``, covariance to ``work.normal`` (grown where residuals are larger than the noise says), residuals in
     units of the noise to ``work.signal_residual``.
     """
     count, normal, step = work.signal_count, work.normal, work.step
     if count < FEWEST_TO_SOLVE:
         return False
+    common = median(work.signal_innovation, count, work)
     for k in range(count):
-        work.signal_weight[k] = 1.0
-    squares = 0.0
+        off = abs(work.signal_innovation[k] - common) / math.sqrt(work.signal_noise[k])
+        work.signal_weight[k] = min(1.0, HUBER / max(off, 1e-12))
     for _ in range(REWEIGHTINGS):
         for i in range(4):
             step[i] = 0.0
@@ -425,7 +424,6 @@ def solve_epoch(work):
             for j in range(4):
                 step[i] += normal[i, j] * work.right[j]
         change = 0.0
-        squares = 0.0
         for k in range(count):
             d = work.signal_direction[k]
             left = work.signal_innovation[k] - d[0] * step[0] - d[1] * step[1] - d[2] * step[2] - step[3]
@@ -434,14 +432,32 @@ def solve_epoch(work):
             change = max(change, abs(weight - work.signal_weight[k]))
             work.signal_weight[k] = weight
             work.signal_residual[k] = residual
-            squares += weight * residual * residual
         if change < 1e-3:
             break
-    factor = max(1.0, squares / (count - FEWEST_TO_SOLVE)) if count > FEWEST_TO_SOLVE else 1.0
+    factor = variance_factor(work)
     for i in range(4):
         for j in range(4):
             normal[i, j] *= factor
     return True
+
+
+@njit
+def variance_factor(work):
+    """Return by how much the squares of the residuals are larger than the noise says, at least 1.
+
+    From their median, which the outliers among them do not change much; with so few that no outlier can be told, from
+    their mean.
+    """
+    count, total = work.signal_count, 0.0
+    if count == FEWEST_TO_SOLVE:
+        return 1.0
+    for k in range(count):
+        work.signal_square[k] = work.signal_residual[k] ** 2
+        total += work.signal_square[k]
+    usual = total / count
+    if count >= FEWEST_TO_EXCLUDE:
+        usual = median(work.signal_square, count, work) / MEDIAN_OF_SQUARES
+    return max(1.0, usual * count / (count - FEWEST_TO_SOLVE))
 
 
 @njit
