@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -48,12 +49,33 @@ class _Wire:
         return int(value)
 
     def text(self) -> str:
-        length = self.number("I")
+        text = self.skip(self.number("I"))
+        return text.split(b"\x00", 1)[0].decode("utf-8", "replace")
+
+    def skip(self, length: int) -> bytes:
         text = self.data[self.position : self.position + length]
         if len(text) < length:
             raise struct.error
         self.position += length
-        return text.split(b"\x00", 1)[0].decode("utf-8", "replace")
+        return text
+
+
+@lru_cache(maxsize=64)
+def _fields(block: bytes, count: int, order: str) -> tuple[PointField, ...]:
+    """Return the fields in their part of a message."""
+    wire = _Wire(b"\x00" * 4 + block, order)
+    return tuple(PointField(wire.text(), wire.number("I"), wire.number("B"), wire.number("I")) for _ in range(count))
+
+
+def _fields_end(data: bytes, start: int, count: int, order: str) -> int:
+    """Return where the fields end that begin at ``start`` (aligned to 4): `_fields` is fast for what it has seen."""
+    length = struct.Struct(order + "I")
+    position = start
+    for _ in range(count):
+        # Name, offset, type, count; all but the type are aligned to 4.
+        position += 4 + length.unpack_from(data, position)[0]
+        position += -position % 4 + 12
+    return position
 
 
 def decode_cloud(payload: NDArray[np.uint8], message: NDArray[Any], index: Callable[[str], int]) -> bool:
@@ -73,7 +95,8 @@ def decode_cloud(payload: NDArray[np.uint8], message: NDArray[Any], index: Calla
         height, width, count = wire.number("I"), wire.number("I"), wire.number("I")
         if count > _MOST_FIELDS:
             return False
-        fields = [PointField(wire.text(), wire.number("I"), wire.number("B"), wire.number("I")) for _ in range(count)]
+        start = wire.position
+        fields = _fields(wire.skip(_fields_end(data, start, count, order) - start), count, order)
         big_endian = bool(wire.number("B"))
         point_step, row_step, size = wire.number("I"), wire.number("I"), wire.number("I")
         content = memoryview(data)[wire.position : wire.position + size]

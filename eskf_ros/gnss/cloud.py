@@ -126,6 +126,8 @@ def number_column(found: NDArray[Any], name: str, missing: float = math.nan) -> 
 
 def whole_column(found: NDArray[Any], name: str, missing: int) -> NDArray[np.int64]:
     """Return a field of points as integers; what is none, or larger than 32 bits, becomes -1."""
+    if name in (found.dtype.names or ()) and found.dtype[name].str[1:] in ("u1", "u2", "i2"):
+        return np.asarray(found[name]).astype(np.int64)
     numbers = number_column(found, name, missing)
     whole = np.isfinite(numbers) & (np.abs(numbers) < 2.0**31)
     return np.where(whole, np.rint(np.where(whole, numbers, 0.0)), -1.0).astype(np.int64)
@@ -248,6 +250,8 @@ def write_epoch(ranges: NDArray[np.void], week: int, seconds: float, satellites:
 def _time_tag(weeks: NDArray[np.int64], seconds: NDArray[np.float64]) -> tuple[int, float, NDArray[np.bool_]]:
     """Return the time tag that most points have, of equally frequent ones the earliest, and which points have it."""
     possible = (weeks >= 0) & (seconds >= 0.0) & (seconds < SECONDS_PER_WEEK)
+    if possible.all() and len(weeks) and (weeks == weeks[0]).all() and (seconds == seconds[0]).all():
+        return int(weeks[0]), float(seconds[0]), possible
     if not possible.any():
         return 0, math.nan, possible
     tags, counts = np.unique(np.stack([weeks[possible], seconds[possible]], axis=1), axis=0, return_counts=True)

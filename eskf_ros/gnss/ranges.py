@@ -126,17 +126,25 @@ _GLONASS = int(Gnss.GLONASS)
 _SIGNAL_COUNT = len(SIGNALS)
 
 
-def allocate_ranges(count: int) -> NDArray[np.void]:
-    """Return ``count`` ranges (RANGE) in which nothing is known yet."""
-    ranges = np.zeros(count, RANGE)
+def _blank() -> bytes:
+    """Return the bytes of a range in which nothing is known yet."""
+    row = np.zeros(1, RANGE)
     for name in RANGE.names or ():
         if RANGE[name].base.kind == "f":
-            ranges[name] = math.nan
-    ranges["signal"] = UNKNOWN_SIGNAL
-    ranges["status"] = Status.NOT_LOCATED
-    ranges["issue"] = NO_ISSUE
-    ranges["noise_factor"] = 1.0
-    return ranges
+            row[name] = math.nan
+    row["signal"] = UNKNOWN_SIGNAL
+    row["status"] = Status.NOT_LOCATED
+    row["issue"] = NO_ISSUE
+    row["noise_factor"] = 1.0
+    return row.tobytes()
+
+
+_BLANK = _blank()
+
+
+def allocate_ranges(count: int) -> NDArray[np.void]:
+    """Return ``count`` ranges (RANGE) in which nothing is known yet."""
+    return np.frombuffer(bytearray(_BLANK * count), RANGE)
 
 
 def locate(ranges: NDArray[np.void], week: int, seconds: float, ephemerides: Ephemerides) -> None:
