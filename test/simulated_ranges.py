@@ -111,7 +111,9 @@ class Ranges:
     def push(self, navigator: Navigator, k: int, signals: NDArray[np.void] | None = None) -> None:
         """Give one epoch to a navigator, or ``signals`` in place of its own."""
         chosen = self.signals[k] if signals is None else signals
-        navigator.push_ranges(int(self.stamp[k]), (WEEK, float(self.seconds[k])), chosen, int(self.arrival[k]))
+        navigator.push_ranges(
+            int(self.stamp[k]), (WEEK, float(self.seconds[k])), chosen, KLOBUCHAR, int(self.arrival[k])
+        )
 
 
 def simulate_ranges(
@@ -152,9 +154,7 @@ def tight_navigator(recording: Recording, **changes: Any) -> Navigator:
 
     named = {key.replace("__", "."): value for key, value in changes.items()}
     mapping = {**recording.parameters(), "alignment.course_std_deg": 0.1, **PARAMETERS, **named}
-    navigator = Navigator(from_mapping(mapping))
-    navigator.set_ionosphere(KLOBUCHAR)
-    return navigator
+    return Navigator(from_mapping(mapping))
 
 
 def run_tight(recording: Recording, ranges: Ranges, navigator: Navigator, stops: NDArray[np.int64]) -> Any:

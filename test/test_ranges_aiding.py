@@ -129,10 +129,9 @@ def test_prediction_and_noise_are_those_of_the_range_model(seed: int, flags: int
     """The innovation is what another implementation leaves of the measurement, less clock and offset."""
     settings = make_settings(mode="tight", gnss__lever_arm=[0.8, -0.2, 1.4], **MOUNT)
     klobuchar = KLOBUCHAR if has_model else NO_KLOBUCHAR
-    settings["klobuchar"] = klobuchar
     state = tight_state(seed)
     payload, work = signal_payload(state, seed, 25.0, flags), make_work()
-    payload[MEASURED] = 22.1e6
+    payload[MEASURED], payload[13:] = 22.1e6, klobuchar
     turn = to_rotation(state["attitude"])
     arm = settings["lever_arms_body"][0]
     rate = state["angular_rate"] - state["gyro_bias"] - turn.inv().apply(state["earth_rate_map"])

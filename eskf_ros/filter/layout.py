@@ -211,7 +211,7 @@ STATE = np.dtype(
 
 IMU = np.dtype([("stamp", "i8"), ("specific_force", "f8", (3,)), ("angular_rate", "f8", (3,))], align=True)
 
-PAYLOAD_SIZE = 16
+PAYLOAD_SIZE = 21
 AID = np.dtype(
     [
         ("stamp", "i8"),
@@ -294,12 +294,11 @@ SETTINGS = np.dtype(
         ("imu_position_base", "f8", (3,)),
         ("lever_arms_body", "f8", (SOURCES, 3)),
         ("correlated_share", "f8"),
-        # Ranges: lowest elevation (rad), factor on variances, floors (m, m/s), Klobuchar parameters (NaN: none).
+        # Ranges: lowest elevation (rad), factor on variances, floors (m, m/s).
         ("elevation_mask", "f8"),
         ("range_covariance_scale", "f8"),
         ("code_std_floor", "f8"),
         ("range_rate_std_floor", "f8"),
-        ("klobuchar", "f8", (8,)),
         ("gate", "f8", (len(Stream), 4)),
         ("reach", "i8", (len(Stream),)),
         ("constrains", "i8", (len(Stream),)),

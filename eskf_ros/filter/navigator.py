@@ -259,7 +259,6 @@ class Navigator:
         self._rows = allocate(ODOMETRY, len(self._imu))
         self._offered = allocate(AID)
         self._memory: tuple[Memory, float] | None = None
-        self._klobuchar = NO_KLOBUCHAR
         self.configure(parameters)
         self.reset()
 
@@ -267,7 +266,6 @@ class Navigator:
         """Use other parameters from now on; history within the window is judged by them when it is applied again."""
         self.parameters = parameters
         self._settings = settings_from(parameters, self._output_rate)
-        self._settings["klobuchar"] = self._klobuchar
         self._intakes = intakes_from(parameters)
         if self._memory is not None:
             recall(*self._memory, parameters, self._settings[0])
@@ -454,11 +452,19 @@ class Navigator:
         self._take(stream, values, covariance)
         self._push_aid(stream, stamp + round(self._intakes[stream].time_offset * SECOND), arrival)
 
-    def push_ranges(self, stamp: int, instant: Instant, signals: np.ndarray, arrival: int = 0) -> None:
+    def push_ranges(
+        self,
+        stamp: int,
+        instant: Instant,
+        signals: np.ndarray,
+        klobuchar: FloatArray = NO_KLOBUCHAR,
+        arrival: int = 0,
+    ) -> None:
         """Take the signals (MEASURED_SIGNAL, `gnss.measurements.measured_epoch`) of one epoch of the first receiver.
 
-        ``stamp``: the instant of the measurement on the IMU's clock; ``instant``: the same in GPS time, to a minute.
-        The signals have been measured without a position, so that they do not depend on when they come.
+        ``stamp``: the instant of the measurement on the IMU's clock; ``instant``: the same in GPS time, to a minute;
+        ``klobuchar``: eight parameters of the ionosphere. The signals have been measured without a position, so that
+        they do not depend on when they come.
         """
         self.range_statuses.update(status_counts(signals))
         is_tight, ranges = self.parameters.mode == "tight", self.parameters.ranges
@@ -475,6 +481,7 @@ class Navigator:
             stamp,
             arrival,
             instant[0] * SECONDS_PER_WEEK + instant[1],
+            klobuchar,
             int(code_door),
             int(rate_door),
             refused,
@@ -485,11 +492,6 @@ class Navigator:
                 self._note_refused(stream, stamp)
         if count:
             self._refused.append(refused[:count])
-
-    def set_ionosphere(self, klobuchar: Sequence[float] | FloatArray) -> None:
-        """Take the eight parameters of Klobuchar's model (alpha, beta), before the first ranges."""
-        self._klobuchar = np.array(klobuchar, np.float64)
-        self._settings["klobuchar"] = self._klobuchar
 
     def take_records(self) -> np.ndarray:
         """Return the records (RECORD) that became final since the last call: in the total order, the too late last."""

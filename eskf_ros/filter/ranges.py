@@ -29,6 +29,7 @@ from eskf_ros.filter.aiding.signal import (
     CN0,
     FLAGS,
     GPS_TIME,
+    KLOBUCHAR,
     MEASURED,
     NOISE_FACTOR,
     SATELLITE,
@@ -115,10 +116,11 @@ REWEIGHTINGS = 20
 
 
 @njit
-def offer_signals(aids, timeline, offered, signals, stamp, arrival, gps_time, code_door, rate_door, refused):
+def offer_signals(aids, timeline, offered, signals, stamp, arrival, gps_time, klobuchar, code_door, rate_door, refused):
     """Sort the usable signals (MEASURED_SIGNAL) of one epoch into the timeline, which has room for two of each.
 
-    ``gps_time``: s since 6 January 1980. Returns how many never enter; ``refused`` (RECORD) says which and why.
+    ``gps_time``: s since 6 January 1980, ``klobuchar``: parameters of the ionosphere (8,). Returns how many never
+    enter; ``refused`` (RECORD) says which and why.
     """
     aid = offered[0]
     count = 0
@@ -146,6 +148,7 @@ def offer_signals(aids, timeline, offered, signals, stamp, arrival, gps_time, co
             payload[CN0] = signal["cn0"]
             payload[NOISE_FACTOR] = signal["noise_factor"]
             payload[GPS_TIME] = gps_time
+            payload[KLOBUCHAR : KLOBUCHAR + 8] = klobuchar
             verdict = insert_aid(aids, timeline, offered)
             if verdict != WAITING:
                 record = refused[count]

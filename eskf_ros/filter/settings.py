@@ -152,7 +152,6 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
     settings["range_covariance_scale"] = parameters.ranges.covariance_scale
     settings["code_std_floor"] = parameters.ranges.code_std_floor
     settings["range_rate_std_floor"] = parameters.ranges.range_rate_std_floor
-    settings["klobuchar"] = math.nan
     place_optional_states(settings[0], parameters)
     settings["static_duration"] = alignment.static_duration
     settings["moving_start_after"] = alignment.moving_start_after

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.bags import Batch
+from eskf_ros.bags import POINT_CLOUD, Batch
 from eskf_ros.filter.layout import Stream
 
 Arguments = Iterable[tuple[Any, ...]]
@@ -108,6 +108,11 @@ def _pressures(batch: Batch) -> Arguments:
     return _vectors(batch, values, covariances)
 
 
+def _clouds(batch: Batch) -> Arguments:
+    messages = batch.messages
+    return zip(messages["stamp"].tolist(), messages["points"], batch.log_time.tolist(), strict=True)
+
+
 FIX = "sensor_msgs/msg/NavSatFix"
 TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
 
@@ -118,6 +123,11 @@ INPUTS = (
     Input("mag", Stream.MAG, "sensor_msgs/msg/MagneticField", _mags),
     Input("wheel", Stream.WHEEL, "nav_msgs/msg/Odometry", _wheels),
     Input("body_velocity", Stream.BODY_VELOCITY, TWIST, _body_velocities),
+    Input("ephemerides", Stream.PSEUDORANGE, POINT_CLOUD, _clouds),
+    Input("ranges", Stream.PSEUDORANGE, POINT_CLOUD, _clouds, is_gnss=True),
     Input("baro", Stream.BARO, "sensor_msgs/msg/FluidPressure", _pressures),
 )
 """All but the IMU. The order is that of messages with one log time."""
+
+FIXES = ("gnss_fix", "gnss_velocity")
+RANGES = ("ranges", "ephemerides")

@@ -20,6 +20,7 @@ from eskf_ros.filter.aiding.signal import (
     CN0,
     FLAGS,
     GPS_TIME,
+    KLOBUCHAR,
     MEASURED,
     NOISE_FACTOR,
     STD,
@@ -55,7 +56,7 @@ def offset_place(system, settings):
 
 
 @njit
-def delays(payload, geodetic, elevation, azimuth, settings):
+def delays(payload, geodetic, elevation, azimuth):
     """Return the delays (m) in ionosphere (NaN without a model) and troposphere, at a place (rad, rad, m)."""
     week = math.floor(payload[GPS_TIME] / SECONDS_PER_WEEK)
     seconds = payload[GPS_TIME] - week * SECONDS_PER_WEEK
@@ -63,7 +64,7 @@ def delays(payload, geodetic, elevation, azimuth, settings):
     ionosphere = 0.0
     if not flags & IONOSPHERE_APPLIED:
         carrier = L1 if math.isnan(payload[CARRIER]) else payload[CARRIER]
-        zenith = klobuchar(settings.klobuchar, seconds, geodetic[0], geodetic[1], elevation, azimuth)
+        zenith = klobuchar(payload[KLOBUCHAR:], seconds, geodetic[0], geodetic[1], elevation, azimuth)
         ionosphere = zenith * ionosphere_scale(carrier)
     tropospheric = 0.0
     if not flags & TROPOSPHERE_APPLIED:
@@ -78,7 +79,7 @@ def predict(state, payload, source, settings):
     unit, length, _ = see(payload, antenna, velocity)
     geodetic = ecef_to_geodetic(antenna[0], antenna[1], antenna[2])
     elevation, azimuth = elevation_azimuth(unit, east_north_up_to_ecef(geodetic[0], geodetic[1]))
-    ionosphere, tropospheric = delays(payload, geodetic, elevation, azimuth, settings)
+    ionosphere, tropospheric = delays(payload, geodetic, elevation, azimuth)
     pseudorange = length + clock_bias(state, settings) + tropospheric
     if not math.isnan(ionosphere):
         pseudorange += ionosphere

@@ -2,8 +2,8 @@
 
 Payload of a pseudorange and of a range rate alike: the measured value (m, m/s; satellite clock and group delay taken
 out), its standard deviation (NaN: by model), satellite position and velocity (ECEF at transmission, m, m/s), flags of
-`gnss.ranges`, carrier (Hz), C/N0 (dB-Hz, NaN unknown), noise factor, GPS time (s since 6 January 1980, for the
-atmosphere). The source names the signal.
+`gnss.ranges`, carrier (Hz), C/N0 (dB-Hz, NaN unknown), noise factor, and for the atmosphere GPS time (s since 6 January
+1980) and the eight parameters of Klobuchar (NaN: none). The source names the signal.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ CARRIER = 9
 CN0 = 10
 NOISE_FACTOR = 11
 GPS_TIME = 12
+KLOBUCHAR = 13
 
 
 @njit
