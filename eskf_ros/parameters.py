@@ -138,6 +138,13 @@ class Topics:
         "nav_msgs/msg/Odometry",
     )
     baro: str = _parameter("baro", "", "sensor_msgs/FluidPressure: air pressure.", **_TOPIC)
+    initial_pose: str = _parameter(
+        "initialpose",
+        "",
+        "geometry_msgs/PoseWithCovarianceStamped in frames.map: puts the estimate there, as RViz's tool does. Position "
+        "and yaw are taken over; a height without variance is not. The replay does not read it.",
+        **_TOPIC,
+    )
 
 
 @dataclass(frozen=True)
