@@ -294,11 +294,12 @@ SETTINGS = np.dtype(
         ("imu_position_base", "f8", (3,)),
         ("lever_arms_body", "f8", (SOURCES, 3)),
         ("correlated_share", "f8"),
-        # Ranges: lowest elevation (rad), factor on variances, floors (m, m/s).
+        # Ranges: lowest elevation (rad), factor on variances, floors (m, m/s), what lasts in their errors (m).
         ("elevation_mask", "f8"),
         ("range_covariance_scale", "f8"),
         ("code_std_floor", "f8"),
         ("range_rate_std_floor", "f8"),
+        ("range_error_std", "f8"),
         ("gate", "f8", (len(Stream), 4)),
         ("reach", "i8", (len(Stream),)),
         ("constrains", "i8", (len(Stream),)),

@@ -152,6 +152,7 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
     settings["range_covariance_scale"] = parameters.ranges.covariance_scale
     settings["code_std_floor"] = parameters.ranges.code_std_floor
     settings["range_rate_std_floor"] = parameters.ranges.range_rate_std_floor
+    settings["range_error_std"] = parameters.ranges.correlated_std
     place_optional_states(settings[0], parameters)
     settings["static_duration"] = alignment.static_duration
     settings["moving_start_after"] = alignment.moving_start_after
@@ -175,8 +176,8 @@ def place_optional_states(settings: np.void, parameters: Parameters) -> None:
     The offsets of the constellations join one by one, with the first signal of each (`ranges`).
     """
     settings["reach"] = end = ERROR_SIZE
-    time = parameters.gnss.correlation_time
     ranges, is_tight = parameters.ranges, parameters.mode == "tight"
+    time = ranges.correlation_time if is_tight else parameters.gnss.correlation_time
     clock_noise = (ranges.clock_bias_noise, ranges.clock_drift_noise)
     # Name, whether it is on, first deviation, driving noise, correlation time (0: random walk), streams that need it.
     blocks: tuple[tuple[str, bool, Deviation, Deviation, float, tuple[Stream, ...]], ...] = (
