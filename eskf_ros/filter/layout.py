@@ -24,7 +24,15 @@ ACCEL_BIAS = 9
 GYRO_BIAS = 12
 ERROR_SIZE = 15
 
-OPTIONAL_SIZES = {"position_error": 3, "clock": 2, "inter_system": 6}
+OPTIONAL_SIZES = {
+    "position_error": 3,
+    "mounting": 2,
+    "wheel_scale": 1,
+    "clock": 2,
+    "inter_system": 6,
+    "baro_offset": 1,
+    "baro_scale": 1,
+}
 """Optional errors behind the core, and how many each is: see ``optional``.
 
 ``clock``: of the receiver, bias (m) and drift (m/s). ``inter_system``: by what the ranges of a constellation are longer
@@ -116,8 +124,12 @@ STREAM_NAMES = tuple(stream.name.lower() for stream in Stream)
 
 CONSTRAINTS = (Stream.ZUPT, Stream.ZARU, Stream.NHC)
 
-CONSTRAINT_INTERVAL = 100_000_000
-"""The grid of the constraints (ns)."""
+CONSTRAINT_INTERVAL = 1_000_000_000
+"""The grid of the constraints (ns).
+
+What makes them wrong (side slip, a body that sways) lasts for about half as long at the least: closer together they
+would not be independent of each other, and the filter would believe their mean too much.
+"""
 
 STATE = np.dtype(
     [
@@ -171,6 +183,14 @@ STATE = np.dtype(
         ("search_tilt_variance", "f8"),
         ("search_age", "f8"),
         ("search_turn", "f8"),
+        # What a sensor says of the unknown heading: its rank, how often it agreed with itself since when, the last
+        # message, by how much (rad) it would turn the attitude, and its standard deviation.
+        ("hint_rank", "i8"),
+        ("hint_count", "i8"),
+        ("hint_since", "i8"),
+        ("hint_stamp", "i8"),
+        ("hint_turn", "f8"),
+        ("hint_std", "f8"),
         # External evidence of motion: when GNSS last proved it, the last fix, and the one the window started from.
         ("motion_stamp", "i8"),
         ("last_fix_stamp", "i8"),
@@ -186,6 +206,16 @@ STATE = np.dtype(
         ("still_stamp", "i8"),
         ("still_count", "i8"),
         ("still_sum", "f8", (6,)),
+        # IMU samples since the last point on the grid of the constraints: the point after them, whether one is missing,
+        # how many, sums.
+        ("block_end", "i8"),
+        ("block_broken", "i8"),
+        ("block_count", "i8"),
+        ("block_sum", "f8", (6,)),
+        ("block_square_sum", "f8", (6,)),
+        # Wheels: when they spoke last, and when the gate last refused to believe them.
+        ("wheel_stamp", "i8"),
+        ("slip_stamp", "i8"),
         # Monitors: windows seen, those at rest, and those in which the IMU cannot be what it should be.
         ("windows", "i8"),
         ("rest_windows", "i8"),
@@ -194,11 +224,17 @@ STATE = np.dtype(
         ("tilted_windows", "i8"),
         ("tilted_force", "f8", (3,)),
         ("fast_windows", "i8"),
+        # Monitors of the heading: sums of cosine and sine, and how many. Messages of the dual antenna against the
+        # estimate; course over ground against the estimate.
+        ("heading_contrast", "f8", (3,)),
+        ("course_contrast", "f8", (3,)),
         # When absolute aids were last accepted, how many were rejected since, and how often that ended in a restart.
         ("absolute_stamp", "i8"),
         ("absolute_interval", "i8"),
         ("rejected_fixes", "i8"),
         ("restarts", "i8"),
+        # When a pressure was last accepted.
+        ("baro_stamp", "i8"),
         # Tight coupling: whether the errors of clock bias and drift have values yet, milliseconds it has jumped by,
         # and how often most of the satellites contradicted the state.
         ("clock_known", "i8", (2,)),
@@ -293,7 +329,16 @@ SETTINGS = np.dtype(
         ("imu_to_base", "f8", (3, 3)),
         ("imu_position_base", "f8", (3,)),
         ("lever_arms_body", "f8", (SOURCES, 3)),
+        ("heading_lines_body", "f8", (SOURCES, 3)),
+        ("baro_arm_body", "f8", (3,)),
         ("correlated_share", "f8"),
+        ("wheel_arm_body", "f8", (3,)),
+        ("wheel_slip", "f8"),
+        ("nhc_arm_body", "f8", (3,)),
+        ("nhc_lateral_std", "f8"),
+        ("nhc_vertical_std", "f8"),
+        ("nhc_angle_std", "f8"),
+        ("nhc_slip", "f8"),
         # Ranges: lowest elevation (rad), factor on variances, floors (m, m/s), what lasts in their errors (m).
         ("elevation_mask", "f8"),
         ("range_covariance_scale", "f8"),
@@ -425,13 +470,14 @@ def allocate(dtype: np.dtype, count: int = 1) -> np.ndarray:
     return memory if COMPILED else memory.view(np.recarray)
 
 
-_EVIDENCE = ("still_stamp", "motion_stamp", "last_fix_stamp", "anchor_stamp")
+_EVIDENCE = ("still_stamp", "motion_stamp", "last_fix_stamp", "anchor_stamp", "block_end", "wheel_stamp", "slip_stamp")
 
 
 def blank_state() -> np.ndarray:
     """Return the state before the first IMU sample."""
     state = allocate(STATE)
-    for field in ("stamp", "imu_stamp", "first_stamp", "window_start", "absolute_stamp", *_EVIDENCE):
+    stamps = ("stamp", "imu_stamp", "first_stamp", "window_start", "absolute_stamp", "baro_stamp")
+    for field in (*stamps, *_EVIDENCE):
         state[field] = NEVER
     state["attitude"][0, 0] = 1.0
     state["error_size"] = ERROR_SIZE

@@ -13,6 +13,9 @@ SECOND = 1_000_000_000
 MEMORY = 100
 """Messages over which delay and rate are taken."""
 
+LONG_AGO = 10.0
+"""Stamps so many seconds behind their arrival are those of a recording, or of a clock that was never set."""
+
 CONFIRMATIONS = 5
 """So many messages in a row must go on from where the stamps jumped to."""
 
@@ -27,6 +30,8 @@ class Stamp(enum.Enum):
     """Further from the others than the window: the estimator's own door decides."""
     STARTED_AGAIN = enum.auto()
     """The stamps went back and go on from there (a bag that loops, a simulation reset): reset, then use the message."""
+    WENT_AHEAD = enum.auto()
+    """They jumped ahead, while this computer's clock did not, and go on from there (a clock was set): worth a word."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +51,10 @@ class Timing:
 class StampMonitor:
     """The stamps of one topic. All times are integer nanoseconds; arrivals are of the node's clock."""
 
-    def __init__(self, topic: str, window: float = 2.0) -> None:
-        """`window` (s): how far out of order stamps may be; the history window of the filter."""
+    def __init__(self, topic: str, window: float = 2.0, sender: str = "") -> None:
+        """`window` (s): how far out of order stamps may be; the history window of the filter. `sender`: of several."""
         self.topic = topic
+        self.label = f"{topic} from {sender}" if sender else topic
         self.zero_count = 0
         self.zero_run = 0
         self.restart_count = 0
@@ -102,7 +108,7 @@ class StampMonitor:
         self._newest = stamp
         self._stamps.append(stamp)
         self._delays.append(arrival - stamp)
-        return Stamp.STARTED_AGAIN if back else Stamp.IN_ORDER
+        return Stamp.STARTED_AGAIN if back else Stamp.WENT_AHEAD
 
     def timing(self, now: int) -> Timing:
         """Delay, spread, rate and silence at `now` (node's clock)."""
@@ -130,21 +136,23 @@ def clock_complaints(monitors: Iterable[StampMonitor], now: int, tolerance: floa
     for monitor in monitors:
         if monitor.zero_run:
             found.append(
-                f"{monitor.zero_count} {'message' if monitor.zero_count == 1 else 'messages'} on {monitor.topic} "
+                f"{monitor.zero_count} {'message' if monitor.zero_count == 1 else 'messages'} on {monitor.label} "
                 "with stamp zero: the driver must fill in header.stamp; without it a measurement has no place in time"
             )
         delay = monitor.timing(now).delay
         if not math.isnan(delay):
-            delays.append((delay, monitor.topic))
+            delays.append((delay, monitor.label))
     if delays:
         (least, quickest), (most, slowest) = min(delays), max(delays)
         if most - least > tolerance:
+            where = f"messages on {slowest} arrive {_delay_text(most)}, on {quickest} {_delay_text(least)}"
+            if least > LONG_AGO:
+                where = f"the stamps on {slowest} are that much further behind their arrival than those on {quickest}"
             found.append(
-                f"sensor clocks differ by {_duration(most - least)}: messages on {slowest} arrive "
-                f"{_delay_text(most)}, on {quickest} {_delay_text(least)}; synchronise the clocks, or set the "
+                f"sensor clocks differ by {_duration(most - least)}: {where}; synchronise the clocks, or set the "
                 "time_offset of the topic"
             )
-        elif least > 10.0 or most < -tolerance:
+        elif least > LONG_AGO or most < -tolerance:
             found.append(
                 f"all messages arrive {_delay_text(statistics.median(delay for delay, _ in delays))}: when they are "
                 "played from a recording or come from a simulator, publish /clock and set use_sim_time; otherwise set "

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from functools import partial
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -12,8 +11,8 @@ from numpy.typing import NDArray
 from eskf_ros.bags import Batch
 from eskf_ros.filter.layout import ODOMETRY, Status
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.inputs import Input
 from eskf_ros.ranges.intake import RangeIntake
-from eskf_ros.replay.inputs import Input
 from eskf_ros.replay.topics import TopicNames
 
 LARGEST_PUSH = 1024
@@ -55,14 +54,7 @@ class Feed:
         self.first_stamp: int | None = None
         self.imu_count = 0
         self.withheld = {kind.stream: 0 for kind in topics.inputs}
-        self._pushes: dict[str, Callable[..., Any]] = {
-            kind.name: partial(navigator.push, kind.stream) for kind in topics.inputs
-        }
-        self._pushes["gnss_fix"] = navigator.push_gnss_position
-        self._pushes["gnss_velocity"] = navigator.push_gnss_velocity
-        if intake is not None:
-            self._pushes["ranges"] = intake.take_ranges
-            self._pushes["ephemerides"] = intake.take_ephemerides
+        self._pushes = {kind.name: kind.push_of(navigator, intake) for kind in topics.inputs}
 
     def ordered(self, batches: Iterable[dict[str, Batch]]) -> Iterable[dict[str, Batch]]:
         """The batches as they have to be pushed."""

@@ -16,11 +16,11 @@ from eskf_ros.bags import BagReader, Batch, open_bag
 from eskf_ros.filter.layout import ODOMETRY
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.gnss.rinex import RinexError
+from eskf_ros.inputs import FIX
 from eskf_ros.parameters import Parameters
 from eskf_ros.ranges.beside import RangesError, merged, read_beside
 from eskf_ros.ranges.intake import RangeIntake
 from eskf_ros.replay.feed import Feed
-from eskf_ros.replay.inputs import FIX
 from eskf_ros.replay.results import ResultFiles, selected
 from eskf_ros.replay.summary import Summary, ranges_result, truth_result
 from eskf_ros.replay.topics import InputError, TopicNames, find_topics, truth_converter

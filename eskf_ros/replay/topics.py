@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from eskf_ros.bags import BagReader, Batch
 from eskf_ros.filter.layout import Stream
+from eskf_ros.inputs import FIX, FIXES, INPUTS, ODOMETRY, RANGES, TWIST, Input
 from eskf_ros.parameters import Parameters, Topics
-from eskf_ros.replay.inputs import FIX, FIXES, INPUTS, RANGES, TWIST, Input
 from eskf_ros.replay.truth import epochs_from_fix, epochs_from_odometry
 from eskf_ros.simulate.map_frame import MapFrame
 
 IMU = "sensor_msgs/msg/Imu"
-ODOMETRY = "nav_msgs/msg/Odometry"
 
 
 class InputError(Exception):
@@ -53,7 +52,8 @@ def find_topics(
     """Find the topics of the parameters, and the `truth` topic unless empty, in the recording.
 
     All but the IMU and what GNSS is used by, fixes or ranges, may be missing as long as their names are the defaults;
-    with `has_range_file` the ranges come from there. A list of hints says what else could be the GNSS velocity.
+    with `has_range_file` the ranges come from there. Where an input can be of several types, the recording says which
+    it is. A list of hints says what else could be the GNSS velocity.
 
     Raises:
         InputError: another topic is missing, has no messages or the wrong type.
@@ -73,7 +73,8 @@ def find_topics(
         is_required = kind.name in ("gnss_fix", "ranges") or name != getattr(Topics(), kind.name)
         if is_required or _find(reader, name):
             instead = " (a RINEX file can be given with --ranges FILE.obs)" if kind.name == "ranges" else ""
-            inputs[kind] = _require(reader, bag, name, (kind.type,), remedy, instead)
+            topic = _require(reader, bag, name, kind.types, remedy, instead)
+            inputs[kind.of_type(reader.topics[topic].type)] = topic
     has_velocity = uses_ranges or any(kind.stream == Stream.GNSS_VELOCITY for kind in inputs)
     hints = [] if has_velocity else _velocity_hint(reader, names, inputs)
     beside = frozenset(inputs[kind] for kind in inputs if kind.name in RANGES) if has_range_file else frozenset()
