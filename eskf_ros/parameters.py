@@ -620,6 +620,22 @@ class Ranges(Aid):
         maximum=1.0e3,
         live=True,
     )
+    correlation_time: float = _parameter(
+        60.0,
+        "s",
+        "How long the common error of the pseudoranges lasts (e-folding time): reflections, orbits, what the models "
+        "leave of the atmosphere. 0: not modelled, and the estimate then trusts the mean of many epochs too much.",
+        minimum=0.0,
+        maximum=1.0e5,
+    )
+    correlated_std: float = _parameter(
+        1.5,
+        "m",
+        "With a correlation_time: the standard deviation of a position, per axis, by errors that last.",
+        above=0.0,
+        maximum=1000.0,
+        live=True,
+    )
     inter_system_std: float = _parameter(
         10.0,
         "m",

@@ -339,11 +339,12 @@ SETTINGS = np.dtype(
         ("nhc_vertical_std", "f8"),
         ("nhc_angle_std", "f8"),
         ("nhc_slip", "f8"),
-        # Ranges: lowest elevation (rad), factor on variances, floors (m, m/s).
+        # Ranges: lowest elevation (rad), factor on variances, floors (m, m/s), what lasts in their errors (m).
         ("elevation_mask", "f8"),
         ("range_covariance_scale", "f8"),
         ("code_std_floor", "f8"),
         ("range_rate_std_floor", "f8"),
+        ("range_error_std", "f8"),
         ("gate", "f8", (len(Stream), 4)),
         ("reach", "i8", (len(Stream),)),
         ("constrains", "i8", (len(Stream),)),

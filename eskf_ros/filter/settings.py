@@ -177,12 +177,14 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
         settings["gate"][0, stream, 1:] = chdtri([1, 2, 3], 1.0 - probability)
     settings["constrains"][0, Stream.ZUPT] = settings["constrains"][0, Stream.ZARU] = parameters.zupt.enabled
     settings["constrains"][0, Stream.NHC] = parameters.nhc.enabled
-    settings["correlated_share"] = parameters.gnss.correlated_share
+    # In mode tight what lasts is in the ranges, and no fix knows of it.
+    settings["correlated_share"] = parameters.gnss.correlated_share if parameters.mode == "loose" else 0.0
     describe_vehicle(settings[0], parameters)
     settings["elevation_mask"] = math.radians(parameters.ranges.elevation_mask_deg)
     settings["range_covariance_scale"] = parameters.ranges.covariance_scale
     settings["code_std_floor"] = parameters.ranges.code_std_floor
     settings["range_rate_std_floor"] = parameters.ranges.range_rate_std_floor
+    settings["range_error_std"] = parameters.ranges.correlated_std
     place_optional_states(settings[0], parameters)
     settings["static_duration"] = alignment.static_duration
     settings["moving_start_after"] = alignment.moving_start_after
@@ -219,11 +221,12 @@ def place_optional_states(settings: np.void, parameters: Parameters) -> None:
     The offsets of the constellations join one by one, with the first signal of each (`ranges`).
     """
     settings["reach"] = end = ERROR_SIZE
-    time, baro = parameters.gnss.correlation_time, parameters.baro
+    baro = parameters.baro
     estimate = parameters.estimate
     mounting_std, mounting_walk = math.radians(estimate.mounting_std_deg), estimate.mounting_random_walk
     scale_std, scale_walk = estimate.wheel_scale_std, estimate.wheel_scale_random_walk
     ranges, is_tight = parameters.ranges, parameters.mode == "tight"
+    time = ranges.correlation_time if is_tight else parameters.gnss.correlation_time
     clock_noise = (ranges.clock_bias_noise, ranges.clock_drift_noise)
     # Name, whether it is on, first deviation, driving noise, correlation time (0: random walk), streams that need it.
     blocks: tuple[tuple[str, bool, Deviation, Deviation, float, tuple[Stream, ...]], ...] = (
