@@ -18,7 +18,7 @@ from eskf_ros.bags import Batch, message_dtype
 from eskf_ros.filter.aiding import heading
 from eskf_ros.filter.layout import Status, Stream, Verdict
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.replay.inputs import INPUTS
+from eskf_ros.inputs import INPUTS
 from eskf_ros.simulate.dual_antenna import DualAntenna
 from eskf_ros.simulate.recording import Recording
 from eskf_ros.simulate.scenario import simulate
