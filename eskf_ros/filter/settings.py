@@ -173,6 +173,13 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
     baseline = _matrix(parameters.heading.mount_rpy_deg)[:, 0]
     settings["heading_lines_body"] = np.array([baseline, (1.0, 0.0, 0.0)]) @ imu_to_base
     settings["baro_arm_body"] = np.subtract(parameters.baro.position, imu.mount_position) @ imu_to_base
+    mag = parameters.mag
+    mag_to_base = _matrix(mag.mount_rpy_deg) if mag.mount_rpy_deg else imu_to_base
+    settings["mag_to_imu"] = imu_to_base.T @ mag_to_base
+    settings["mag_strength_tolerance"] = mag.strength_tolerance
+    settings["mag_inclination_tolerance"] = math.radians(mag.inclination_tolerance_deg)
+    settings["mag_error_distance"] = mag.error_distance
+    settings["is_orientation_magnetic"] = alignment.imu_orientation == "magnetic_north"
     for stream, probability in gate_probabilities(parameters).items():
         settings["gate"][0, stream, 1:] = chdtri([1, 2, 3], 1.0 - probability)
     settings["constrains"][0, Stream.ZUPT] = settings["constrains"][0, Stream.ZARU] = parameters.zupt.enabled
@@ -221,7 +228,7 @@ def place_optional_states(settings: np.void, parameters: Parameters) -> None:
     The offsets of the constellations join one by one, with the first signal of each (`ranges`).
     """
     settings["reach"] = end = ERROR_SIZE
-    baro = parameters.baro
+    baro, mag = parameters.baro, parameters.mag
     estimate = parameters.estimate
     mounting_std, mounting_walk = math.radians(estimate.mounting_std_deg), estimate.mounting_random_walk
     scale_std, scale_walk = estimate.wheel_scale_std, estimate.wheel_scale_random_walk
@@ -238,6 +245,8 @@ def place_optional_states(settings: np.void, parameters: Parameters) -> None:
         # Not by whether it is used, which may change while running: places stay.
         ("baro_offset", True, baro.offset_std, baro.offset_random_walk, 0.0, (Stream.BARO,)),
         ("baro_scale", True, baro.scale_std, 0.0, 0.0, (Stream.BARO,)),
+        ("mag_error", True, math.radians(mag.error_std_deg), 0.0, 0.0, (Stream.MAG,)),
+        ("magnetic_bias", estimate.magnetic_bias, estimate.magnetic_bias_std, 0.0, 0.0, (Stream.MAG,)),
     )
     for name, is_on, std, noise_density, time, streams in blocks:
         settings[f"{name}_at"] = end if is_on else NOWHERE
