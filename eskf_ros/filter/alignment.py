@@ -1,4 +1,7 @@
-"""Start-up: level from gravity, position from the first fix, heading from a parameter or from acceleration and course.
+"""Start-up: level from gravity, position from the first fix, heading from what there is.
+
+In this order: a parameter or the memory of the last run, a sensor that tells it (``heading_hints``), or acceleration
+(``heading_search``), sharpened by the course.
 
 While the heading is unknown its error has the variance of a half turn and is not estimated: GNSS moves position and
 velocity only (``strapdown.step`` cuts the coupling), the gyros carry the attitude. Every still window until the
