@@ -73,6 +73,7 @@ from eskf_ros.filter.timeline import (
 )
 from eskf_ros.filter.update import update
 from eskf_ros.filter.warm_start import Memory, recall
+from eskf_ros.filter.wheel_heading import search_with_wheels
 from eskf_ros.gnss.measurements import MEASURED_SIGNAL
 from eskf_ros.gnss.range_model import NO_KLOBUCHAR
 from eskf_ros.gnss.ranges import Status as RangeStatus
@@ -204,6 +205,9 @@ def fuse(state, aids, i, settings, work):
         note_velocity(state, aid, settings)
         watch_course(state, aid, heading_of(state, settings), settings)
     if not is_aligned_for(state, aid.stream):
+        if aid.stream == WHEEL:
+            search_with_wheels(state, aid.payload, settings.gate[WHEEL, 2], settings, work)
+            watch_wheels(state, aid)
         aid.verdict = BEFORE_ALIGNMENT if aid.stream < FIRST_CONSTRAINT else INACTIVE
         return
     if aid.stream == HEADING and aid.source == heading.IMU_ORIENTATION and state.heading_known == 1:
