@@ -850,7 +850,7 @@ def test_compiling_is_told_and_loading_from_the_cache_is_not(tmp_path: Path) -> 
             told = []
             with while_compiling(told.append):
                 doubled(1.0), doubled(1), doubled(2.0)
-            doubled((1.0, 2))
+            doubled(1j)
             print(told)
             """)
     )

@@ -88,8 +88,9 @@ class Extrinsics:
                 if pose is None or sensor in self._found:
                     continue
                 self._found[sensor] = pose
-                place = " ".join(f"{value:.3f}" for value in pose[0])
-                angles = " ".join(f"{value:.2f}" for value in roll_pitch_yaw_deg(pose[1]))
+                # Plus zero: no sign on a zero.
+                place = " ".join(f"{value:.3f}" for value in np.round(pose[0], 3) + 0.0)
+                angles = " ".join(f"{value:.2f}" for value in np.round(roll_pitch_yaw_deg(pose[1]), 2) + 0.0)
                 lines.append(
                     f"{sensor} in {self._base_link}, from /tf_static by its frame {frame}: "
                     f"position {place} m, roll pitch yaw {angles} deg"
