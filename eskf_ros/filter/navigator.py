@@ -37,6 +37,7 @@ from eskf_ros.filter.layout import (
     STATE,
     TIMELINE,
     WORK,
+    Phase,
     Status,
     Stream,
     Verdict,
@@ -47,7 +48,7 @@ from eskf_ros.filter.local import carry, measure_step, note_jump
 from eskf_ros.filter.monitors import complaints
 from eskf_ros.filter.optional import join
 from eskf_ros.filter.output import status_of, write_odometry
-from eskf_ros.filter.recovery import is_near_gate, judge_filter, update_weighed_down, watch_solution
+from eskf_ros.filter.recovery import gate_of, phase_of, recover, watch_solution
 from eskf_ros.filter.settings import intakes_from, settings_from
 from eskf_ros.filter.strapdown import SECOND, propagate
 from eskf_ros.filter.timeline import (
@@ -62,6 +63,7 @@ from eskf_ros.filter.timeline import (
     save_checkpoint,
     take_final,
 )
+from eskf_ros.filter.track import follow
 from eskf_ros.filter.update import update
 from eskf_ros.filter.warm_start import Memory, recall
 from eskf_ros.parameters import Parameters
@@ -186,24 +188,20 @@ def fuse(state, aids, i, settings, work):
         start_position(state, aid.payload)
         recall_heading(state, aid.payload, settings)
     join(state, settings.reach[aid.stream], settings)
-    if aid.stream == GNSS_POSITION:
-        watch_solution(state, aid, settings)
+    watch_solution(state, aid, settings)
     size = linearize(state, aid, settings, work)
     if size == 0:
         aid.verdict = INACTIVE
         return
-    gate = settings.gate[aid.stream, size]
     for k in range(size):
         aid.innovation[k] = work.innovation[k]
     aid.dof = size
+    follow(state, aid, work)
+    gate = gate_of(state, aid, size, settings)
     aid.verdict, aid.nis = update(state, size, gate, work)
-    if aid.stream == GNSS_POSITION and is_near_gate(aid.verdict, aid.nis, gate):
-        linearize(state, aid, settings, work)
-        aid.verdict = update_weighed_down(state, size, aid.nis / gate, work)
+    recover(state, aid, size, gate, settings, work)
     if aid.verdict == FUSED and state.heading_known == 0:
         search_heading(state, aid, gate, settings, work)
-    if aid.stream == GNSS_POSITION:
-        judge_filter(state, aid.verdict)
     note_jump(state, position, heading, settings)
 
 
@@ -533,6 +531,15 @@ class Navigator:
         return int(self._states["restarts"][0])
 
     @property
+    def position_resets(self) -> int:
+        """How often fixes that agree with each other won over the filter: position and velocity were reset to them."""
+        return int(self._states["resets"][0])
+
+    def phase(self, stream: Stream, source: int = 0) -> Phase:
+        """Return what an aid is to the filter at the moment; ``source``: which receiver."""
+        return Phase(phase_of(self._states[0], int(stream), source))
+
+    @property
     def complaints(self) -> list[str]:
         """What is wrong with whole streams, one sentence each with what to do; empty when nothing is."""
         found = complaints(self._states[0])
@@ -655,6 +662,7 @@ def compile_kernels() -> None:
     trial.take_records()
     trial.odometry  # noqa: B018 - asked for its side effect
     trial.status  # noqa: B018
+    trial.phase(Stream.GNSS_POSITION)
     trial._forget()
     trial.take_live()
     trial.set_datum(0.0, 0.0, 0.0)
