@@ -77,6 +77,7 @@ _TOPIC = {
     "pattern": r"(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*",
     "pattern_text": "a ROS topic name like imu/data or /robot/imu",
 }
+_TYPE = "Message type of this topic, where the driver publishes another one. The replay takes what was recorded."
 
 
 @dataclass(frozen=True)
@@ -107,12 +108,25 @@ class Topics:
         "geometry_msgs/TwistWithCovarianceStamped: velocity of the GNSS antenna, East-North-Up.",
         **_TOPIC,
     )
+    gnss_velocity_type: str = _choice(
+        "geometry_msgs/msg/TwistWithCovarianceStamped", _TYPE, "geometry_msgs/msg/TwistStamped"
+    )
     heading: str = _parameter(
-        "gnss/heading", "", "sensor_msgs/Imu: yaw of a dual-antenna receiver, with its covariance.", **_TOPIC
+        "gnss/heading",
+        "",
+        "sensor_msgs/Imu of a dual-antenna receiver: yaw (0 = east, counter-clockwise) and pitch of the baseline; one "
+        "whose variance is above 1 rad2 is not used.",
+        **_TOPIC,
     )
     mag: str = _parameter("imu/mag", "", "sensor_msgs/MagneticField: magnetometer in the frame of the IMU.", **_TOPIC)
     wheel: str = _parameter(
         "wheel/odom", "", "nav_msgs/Odometry: wheel odometry, of which speed and yaw rate are used.", **_TOPIC
+    )
+    wheel_type: str = _choice(
+        "nav_msgs/msg/Odometry",
+        _TYPE,
+        "geometry_msgs/msg/TwistWithCovarianceStamped",
+        "geometry_msgs/msg/TwistStamped",
     )
     body_velocity: str = _parameter(
         "body_velocity",
@@ -120,6 +134,12 @@ class Topics:
         "geometry_msgs/TwistWithCovarianceStamped: velocity in the axes of the vehicle, of a DVL, optical flow, radar "
         "or odometry of any kind; an axis with a negative variance is absent.",
         **_TOPIC,
+    )
+    body_velocity_type: str = _choice(
+        "geometry_msgs/msg/TwistWithCovarianceStamped",
+        _TYPE,
+        "geometry_msgs/msg/TwistStamped",
+        "nav_msgs/msg/Odometry",
     )
     baro: str = _parameter("baro", "", "sensor_msgs/FluidPressure: air pressure.", **_TOPIC)
 
@@ -366,6 +386,16 @@ class Aid:
 
 @dataclass(frozen=True)
 class Heading(Aid):
+    mount_rpy_deg: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0),
+        "deg",
+        "Orientation of the baseline in base_link, whose yaw and pitch the messages tell: roll, pitch, yaw about fixed "
+        "axes as in a URDF, of a frame whose x axis leads from the first antenna (of u-blox: the moving base) to the "
+        "second. [0.0, 0.0, 0.0]: the second is in front; [0.0, 0.0, 90.0]: it is on the left; [0.0, 0.0, 180.0]: it "
+        "is behind.",
+        minimum=-360.0,
+        maximum=360.0,
+    )
     std_floor_deg: float = _parameter(
         0.2, "deg", "The standard deviation is never taken smaller than this.", above=0.0, maximum=90.0, live=True
     )
@@ -398,6 +428,23 @@ class Mag(Aid):
 
 @dataclass(frozen=True)
 class Wheel(Aid):
+    position: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0),
+        "m",
+        "The point of base_link whose forward speed the wheels show: the middle of the axle they are on, or the place "
+        "of a single wheel.",
+        minimum=-1000.0,
+        maximum=1000.0,
+    )
+    slip: float = _parameter(
+        0.005,
+        "s2/m",
+        "Tyres slip by this share of the speed for every m/s2 of acceleration. The default is that of a car on dry "
+        "asphalt; loose ground takes several times as much.",
+        minimum=0.0,
+        maximum=1.0,
+        live=True,
+    )
     speed_std_floor: float = _parameter(
         0.05,
         "m/s",
@@ -444,6 +491,37 @@ class BodyVelocity(Aid):
 
 @dataclass(frozen=True)
 class Baro(Aid):
+    position: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0),
+        "m",
+        "Position of the barometer in base_link, x forward, y left, z up.",
+        minimum=-1000.0,
+        maximum=1000.0,
+    )
+    offset_std: float = _parameter(
+        300.0,
+        "m",
+        "Standard deviation at first of the difference between pressure altitude and height: weather and geoid. "
+        "It is estimated.",
+        above=0.0,
+        maximum=1.0e4,
+    )
+    offset_random_walk: float = _parameter(
+        0.1,
+        "m/s/rtHz",
+        "How fast that difference wanders, by weather, wind and warming up: by this value times the square root of the "
+        "seconds passed. The default is 6 m in one hour; more where air is blown about, as in a vehicle.",
+        minimum=0.0,
+        maximum=100.0,
+    )
+    scale_std: float = _parameter(
+        0.03,
+        "",
+        "Standard deviation of the factor by which pressure altitude grows faster or slower than height: 0.03 where "
+        "the air is 9 K warmer or colder than in the standard atmosphere. It is estimated.",
+        minimum=0.0,
+        maximum=1.0,
+    )
     std_floor: float = _parameter(
         3.0, "Pa", "The standard deviation is never taken smaller than this.", above=0.0, maximum=1.0e4, live=True
     )
@@ -467,6 +545,84 @@ class Nhc:
         "For vehicles on wheels: they move neither sideways nor up and down at the rear axle (non-holonomic "
         "constraint).",
         live=True,
+    )
+    position: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0),
+        "m",
+        "The point of base_link that does not move sideways: the middle of the axle that does not steer, usually the "
+        "rear one.",
+        minimum=-1000.0,
+        maximum=1000.0,
+    )
+    lateral_std: float = _parameter(
+        0.05,
+        "m/s",
+        "Standard deviation of the lateral velocity, however slow the vehicle is.",
+        above=0.0,
+        maximum=100.0,
+        live=True,
+    )
+    vertical_std: float = _parameter(
+        0.1,
+        "m/s",
+        "The same of the vertical velocity: bumps and springs.",
+        above=0.0,
+        maximum=100.0,
+        live=True,
+    )
+    angle_std_deg: float = _parameter(
+        0.3,
+        "deg",
+        "How far the direction of travel differs from the axes of the vehicle on a straight road (camber, side wind), "
+        "as a standard deviation.",
+        minimum=0.0,
+        maximum=90.0,
+        live=True,
+    )
+    slip: float = _parameter(
+        0.01,
+        "rad s2/m",
+        "What acceleration adds to this angle, by side slip of the tyres in turns, and by springs, for every m/s2. The "
+        "default is about twice what a car shows, because these errors last for seconds.",
+        minimum=0.0,
+        maximum=1.0,
+        live=True,
+    )
+
+
+@dataclass(frozen=True)
+class Estimate:
+    wheel_scale: bool = _parameter(
+        True,
+        "",
+        "Estimate what the wheels multiply the speed with: nobody knows the radius of a tyre to a per mille.",
+    )
+    wheel_scale_std: float = _parameter(
+        0.03, "", "Standard deviation of the scale of the wheels at start.", above=0.0, maximum=1.0
+    )
+    wheel_scale_random_walk: float = _parameter(
+        5.0e-5,
+        "1/rtHz",
+        "How fast the scale of the wheels wanders with load and tyre pressure: by this value times the square root of "
+        "the seconds passed.",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    mounting: bool = _parameter(
+        True,
+        "",
+        "Estimate yaw and pitch of the direction in which the vehicle rolls against the x axis of base_link, where "
+        "wheels or nhc need it.",
+    )
+    mounting_std_deg: float = _parameter(
+        2.0, "deg", "Standard deviation of these angles at start.", above=0.0, maximum=45.0
+    )
+    mounting_random_walk: float = _parameter(
+        3.0e-5,
+        "rad/rtHz",
+        "How fast these angles wander with the load: by this value times the square root of the seconds passed.",
+        minimum=0.0,
+        maximum=1.0,
     )
 
 
@@ -645,6 +801,7 @@ class Parameters:
     baro: Baro = _group(Baro, "Barometer.")
     zupt: Zupt = _group(Zupt, "Standing still.")
     nhc: Nhc = _group(Nhc, "Non-holonomic constraint.")
+    estimate: Estimate = _group(Estimate, "What is estimated besides the motion and the biases of the IMU.")
     history: History = _group(History, "Late and out-of-order messages.")
     alignment: Alignment = _group(Alignment, "Start-up: levelling, heading, and when the estimate is called good.")
     warm_start: WarmStart = _group(WarmStart, "What the node remembers of its last run.")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,21 +14,12 @@ from numpy.typing import NDArray
 from eskf_ros.bags.errors import BagError
 from eskf_ros.bags.mcap_file import MAGIC, McapFile
 from eskf_ros.bags.messages import StringTable, decode, message_dtype
-from eskf_ros.bags.records import Block, Payloads, Source, TopicInfo
+from eskf_ros.bags.records import Batch, Block, Payloads, Source, TopicInfo
 from eskf_ros.bags.row_files import RosbagsDirectory, SqliteFile
 
 __all__ = ["BagReader", "Batch", "TopicInfo", "open_bag"]
 
 _BATCH_MESSAGES = 8192  # smaller batches are collected: a bag with images has few other messages in a chunk
-
-
-@dataclass
-class Batch:
-    """Messages of one topic, sorted by (log time, order in the file)."""
-
-    log_time: NDArray[np.int64]  # (n,) ns
-    messages: NDArray[Any]  # (n,) structured, see `message_dtype`
-    strings: Sequence[str]  # what `frame_id` (and `child_frame_id`) of the messages are indices into
 
 
 @dataclass
@@ -120,6 +111,14 @@ class BagReader:
                     f"{self._sources[0].name}: topic {topic} is of type {self.topics[topic].type}, not {type_name}"
                 )
         return self._batches(topics)
+
+    def serialised(self, topics: Iterable[str]) -> Iterator[tuple[str, Payloads]]:
+        """Read the recording once and give out the messages as they are stored: (topic, messages) in no strict order.
+
+        Blocks come by their start, so that what is far apart in time comes in order. For topics of any type.
+        """
+        for _, block in self._blocks({topic: self.topics[topic].type for topic in topics}):
+            yield from block.load().items()
 
     def _batches(self, topics: Mapping[str, str]) -> Iterator[dict[str, Batch]]:
         self.bytes_done = 0

@@ -23,7 +23,7 @@ ACCEL_BIAS = 9
 GYRO_BIAS = 12
 ERROR_SIZE = 15
 
-OPTIONAL_SIZES = {"position_error": 3}
+OPTIONAL_SIZES = {"position_error": 3, "mounting": 2, "wheel_scale": 1, "baro_offset": 1, "baro_scale": 1}
 """Optional errors behind the core, and how many each is: see ``optional``."""
 
 OPTIONAL_CAPACITY = sum(OPTIONAL_SIZES.values())
@@ -63,8 +63,8 @@ class Status(IntEnum):
 class Phase(IntEnum):
     """What an aid is to the filter (see ``recovery``).
 
-    SUSPICIOUS: the latest measurements were rejected. OUTAGE: none came for a while. REACQUIRING: they come, but none was
-    accepted for a while, or not for long yet. RESET: a short while ago they won over the filter.
+    SUSPICIOUS: the latest measurements were rejected. OUTAGE: none came for a while. REACQUIRING: they come, but none
+    was accepted for a while, or not for long yet. RESET: a short while ago they won over the filter.
     """
 
     WAITING = 0
@@ -129,8 +129,12 @@ CONSTRAINTS = (Stream.ZUPT, Stream.ZARU, Stream.NHC)
 SENSOR_STREAMS = int(min(CONSTRAINTS))
 """So many streams, the first by rank, are those of sensors."""
 
-CONSTRAINT_INTERVAL = 100_000_000
-"""The grid of the constraints (ns)."""
+CONSTRAINT_INTERVAL = 1_000_000_000
+"""The grid of the constraints (ns).
+
+What makes them wrong (side slip, a body that sways) lasts for about half as long at the least: closer together they
+would not be independent of each other, and the filter would believe their mean too much.
+"""
 
 STATE = np.dtype(
     [
@@ -184,6 +188,14 @@ STATE = np.dtype(
         ("search_tilt_variance", "f8"),
         ("search_age", "f8"),
         ("search_turn", "f8"),
+        # What a sensor says of the unknown heading: its rank, how often it agreed with itself since when, the last
+        # message, by how much (rad) it would turn the attitude, and its standard deviation.
+        ("hint_rank", "i8"),
+        ("hint_count", "i8"),
+        ("hint_since", "i8"),
+        ("hint_stamp", "i8"),
+        ("hint_turn", "f8"),
+        ("hint_std", "f8"),
         # External evidence of motion: when GNSS last proved it, the last fix, and the one the window started from.
         ("motion_stamp", "i8"),
         ("last_fix_stamp", "i8"),
@@ -199,6 +211,16 @@ STATE = np.dtype(
         ("still_stamp", "i8"),
         ("still_count", "i8"),
         ("still_sum", "f8", (6,)),
+        # IMU samples since the last point on the grid of the constraints: the point after them, whether one is missing,
+        # how many, sums.
+        ("block_end", "i8"),
+        ("block_broken", "i8"),
+        ("block_count", "i8"),
+        ("block_sum", "f8", (6,)),
+        ("block_square_sum", "f8", (6,)),
+        # Wheels: when they spoke last, and when the gate last refused to believe them.
+        ("wheel_stamp", "i8"),
+        ("slip_stamp", "i8"),
         # Monitors: windows seen, those at rest, and those in which the IMU cannot be what it should be.
         ("windows", "i8"),
         ("rest_windows", "i8"),
@@ -207,6 +229,10 @@ STATE = np.dtype(
         ("tilted_windows", "i8"),
         ("tilted_force", "f8", (3,)),
         ("fast_windows", "i8"),
+        # Monitors of the heading: sums of cosine and sine, and how many. Messages of the dual antenna against the
+        # estimate; course over ground against the estimate.
+        ("heading_contrast", "f8", (3,)),
+        ("course_contrast", "f8", (3,)),
         # When absolute aids were last accepted, how many were rejected since, and how often that ended in a restart.
         ("absolute_stamp", "i8"),
         ("absolute_interval", "i8"),
@@ -329,7 +355,16 @@ SETTINGS = np.dtype(
         ("imu_to_base", "f8", (3, 3)),
         ("imu_position_base", "f8", (3,)),
         ("lever_arms_body", "f8", (SOURCES, 3)),
+        ("heading_lines_body", "f8", (SOURCES, 3)),
+        ("baro_arm_body", "f8", (3,)),
         ("correlated_share", "f8"),
+        ("wheel_arm_body", "f8", (3,)),
+        ("wheel_slip", "f8"),
+        ("nhc_arm_body", "f8", (3,)),
+        ("nhc_lateral_std", "f8"),
+        ("nhc_vertical_std", "f8"),
+        ("nhc_angle_std", "f8"),
+        ("nhc_slip", "f8"),
         ("gate", "f8", (len(Stream), 4)),
         ("reach", "i8", (len(Stream),)),
         ("constrains", "i8", (len(Stream),)),
@@ -438,7 +473,7 @@ def allocate(dtype: np.dtype, count: int = 1) -> np.ndarray:
     return memory if COMPILED else memory.view(np.recarray)
 
 
-_EVIDENCE = ("still_stamp", "motion_stamp", "last_fix_stamp", "anchor_stamp")
+_EVIDENCE = ("still_stamp", "motion_stamp", "last_fix_stamp", "anchor_stamp", "block_end", "wheel_stamp", "slip_stamp")
 _RECOVERY = ("aid_stamp", "aid_fused_stamp", "aid_fused_since", "track_stamp", "reset_stamp")
 
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
-from eskf_ros.filter.aiding import gnss_position, gnss_velocity
+from eskf_ros.filter.aiding import baro, gnss_position, gnss_velocity, heading, nhc, wheel
 from eskf_ros.filter.alignment import (
     heading_of,
     move_datum,
@@ -25,7 +25,8 @@ from eskf_ros.filter.alignment import (
     start_position,
     watch_stillness,
 )
-from eskf_ros.filter.door import admit
+from eskf_ros.filter.door import ABSENT, admit
+from eskf_ros.filter.heading_hints import is_heading_told
 from eskf_ros.filter.layout import (
     AID,
     CONSTRAINTS,
@@ -45,11 +46,12 @@ from eskf_ros.filter.layout import (
     blank_state,
 )
 from eskf_ros.filter.local import carry, measure_step, note_jump
-from eskf_ros.filter.monitors import complaints
+from eskf_ros.filter.monitors import complaints, watch_course, watch_heading
 from eskf_ros.filter.optional import join
 from eskf_ros.filter.output import status_of, write_odometry
 from eskf_ros.filter.recovery import gate_of, phase_of, recover, watch_solution
 from eskf_ros.filter.settings import intakes_from, settings_from
+from eskf_ros.filter.stillness import add_to_block, watch_wheels
 from eskf_ros.filter.strapdown import SECOND, propagate
 from eskf_ros.filter.timeline import (
     CHECKPOINT_SPACING,
@@ -74,6 +76,10 @@ StampArray = npt.NDArray[np.int64]
 
 GNSS_POSITION = int(Stream.GNSS_POSITION)
 GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
+WHEEL = int(Stream.WHEEL)
+NHC = int(Stream.NHC)
+HEADING = int(Stream.HEADING)
+BARO = int(Stream.BARO)
 OPEN_DOOR = int(Verdict.WAITING)
 FIRST_CONSTRAINT = int(min(CONSTRAINTS))
 FUSED = int(Verdict.FUSED)
@@ -88,6 +94,8 @@ IMU_BATCH = 1024
 
 HIGHEST_ALTITUDE = 1e5
 """What no receiver on a robot reports (m)."""
+
+DIAGONAL = np.eye(3).ravel()
 
 NO_STAND_IN = (0.0, 0.0, 0.0)
 """The covariance of a message is its own."""
@@ -116,6 +124,7 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
         take_sample(state, sample)
         measure_step(state, settings)
         watch_stillness(state, settings)
+        add_to_block(state, settings)
         save_checkpoint(states, checkpoints, t)
 
         is_new = sample.stamp > t.published and state.level_known == 1
@@ -179,11 +188,12 @@ def fuse(state, aids, i, settings, work):
         note_position(state, aid, settings)
     elif aid.stream == GNSS_VELOCITY:
         note_velocity(state, aid, settings)
+        watch_course(state, aid, heading_of(state, settings), settings)
     if not is_aligned_for(state, aid.stream):
         aid.verdict = BEFORE_ALIGNMENT if aid.stream < FIRST_CONSTRAINT else INACTIVE
         return
     position = (state.position_map[0], state.position_map[1], state.position_map[2])
-    heading = heading_of(state, settings)
+    heading_before = heading_of(state, settings)
     if state.position_known == 0 and aid.stream == GNSS_POSITION:
         start_position(state, aid.payload)
         recall_heading(state, aid.payload, settings)
@@ -193,6 +203,13 @@ def fuse(state, aids, i, settings, work):
     if size == 0:
         aid.verdict = INACTIVE
         return
+    if aid.stream == HEADING:
+        watch_heading(state, aid, work)
+        if state.heading_known == 0:
+            if not is_heading_told(state, aid, settings, work):
+                aid.verdict = BEFORE_ALIGNMENT
+                return
+            size = linearize(state, aid, settings, work)
     for k in range(size):
         aid.innovation[k] = work.innovation[k]
     aid.dof = size
@@ -202,7 +219,9 @@ def fuse(state, aids, i, settings, work):
     recover(state, aid, size, gate, settings, work)
     if aid.verdict == FUSED and state.heading_known == 0:
         search_heading(state, aid, gate, settings, work)
-    note_jump(state, position, heading, settings)
+    if aid.stream == WHEEL:
+        watch_wheels(state, aid)
+    note_jump(state, position, heading_before, settings)
 
 
 @njit
@@ -212,7 +231,7 @@ def is_aligned_for(state, stream):
         return False
     if stream == GNSS_POSITION:
         return True
-    if stream == GNSS_VELOCITY:
+    if stream in (GNSS_VELOCITY, HEADING, BARO):
         return state.position_known == 1
     return state.position_known == 1 and state.heading_known == 1
 
@@ -225,6 +244,14 @@ def linearize(state, aid, settings, work):
     """
     if aid.stream == GNSS_POSITION:
         return gnss_position.linearize(state, aid.payload, aid.source, settings, work)
+    if aid.stream == WHEEL:
+        return wheel.linearize(state, aid.payload, settings, work)
+    if aid.stream == NHC:
+        return nhc.linearize(state, settings, work)
+    if aid.stream == HEADING:
+        return heading.linearize(state, aid.payload, aid.source, settings, work)
+    if aid.stream == BARO:
+        return baro.linearize(state, aid.payload, aid.source, settings, work)
     return gnss_velocity.linearize(state, aid.payload, aid.source, settings, work)
 
 
@@ -568,6 +595,8 @@ class Navigator:
         intake = self._intakes[stream]
         matrix = np.ascontiguousarray(covariance, np.float64)
         is_absent = not matrix.any() or (matrix[0] < 0.0 and not intake.may_lack_axes)
+        if intake.largest_variance < math.inf:
+            matrix = np.where((matrix > intake.largest_variance) & (DIAGONAL == 1.0), ABSENT, matrix)
         x, y, z = intake.unknown_std
         stand_in = (x * x, y * y, z * z) if is_absent else NO_STAND_IN
         self._admit(stream, (float(values[0]), float(values[1]), float(values[2])), matrix, stand_in)
@@ -586,7 +615,7 @@ class Navigator:
         aid = self._offered[0]
         if not intake.is_used:
             aid["door"] = Verdict.DISABLED
-        elif aid["door"] == Verdict.WAITING and max(map(abs, values)) > intake.largest:
+        elif aid["door"] == Verdict.WAITING and (max(map(abs, values)) > intake.largest or values[0] < intake.lowest):
             aid["door"] = Verdict.BAD_VALUE
         if aid["door"] == Verdict.WAITING and stand_in is not NO_STAND_IN:
             self._stand_ins += 1

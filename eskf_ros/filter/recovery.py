@@ -37,6 +37,7 @@ from eskf_ros.filter.update import project, update
 
 GNSS_POSITION = int(Stream.GNSS_POSITION)
 GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
+BARO = int(Stream.BARO)
 
 FUSED = int(Verdict.FUSED)
 GATE = int(Verdict.GATE)
@@ -68,6 +69,9 @@ of the one before."""
 
 NEAR_GATE = 4.0
 """Up to so many times the gate (twice the innovation) a filter may be too sure of itself; beyond, the fix is wrong."""
+
+REJECTED_PRESSURE = 5_000_000_000
+"""So long (ns) pressures are rejected before their offset is taken for another one."""
 
 NOTHING_PASSES = -1.0
 """A gate."""
@@ -117,25 +121,29 @@ def gate_of(state, aid, size, settings):
 
 @njit
 def recover(state, aid, size, gate, settings, work):
-    """Note what became of a measurement; let rejected fixes that agree with each other win over the filter.
+    """Note what became of a measurement; let rejected ones that agree with each other win over the filter.
 
-    ``gate`` as it was for the update of this measurement, ``size`` scalars described by ``work``.
+    ``gate`` as it was for the update of this measurement, ``size`` scalars described by ``work``. A pressure outside
+    its gate for long means that a door or a fan has changed it for good: it says nothing of the height, but soon again
+    of its changes.
     """
     stream, source = aid.stream, aid.source
     if stream >= SENSOR_STREAMS:
         return
-    is_position = stream == GNSS_POSITION
-    if is_position and gate == NOTHING_PASSES:
+    if stream == GNSS_POSITION and gate == NOTHING_PASSES:
         aid.verdict = CONTRADICTED
-    elif is_position and aid.verdict == GATE:
+    elif stream == GNSS_POSITION and aid.verdict == GATE:
         if has_won(state, source):
             reset(state, source, settings, work)
             aid.verdict = RESET
         elif aid.nis <= NEAR_GATE * gate:
             update_weighed_down(state, size, aid.nis / gate, work)
             aid.verdict = WEIGHED_DOWN
+    is_lasting = state.stamp - state.aid_fused_stamp[stream, source] > REJECTED_PRESSURE
+    if stream == BARO and aid.verdict == GATE and is_lasting:
+        renew(state, settings.baro_offset_at, 1, settings)
     note(state, stream, source, aid.verdict)
-    if is_position and is_lost(state):
+    if stream == GNSS_POSITION and is_lost(state):
         restart(state)
 
 

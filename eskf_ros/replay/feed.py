@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from functools import partial
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.bags import Batch
-from eskf_ros.filter.layout import ODOMETRY, Status, Stream
+from eskf_ros.filter.layout import ODOMETRY, Status
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.replay.inputs import Input
+from eskf_ros.inputs import Input
 from eskf_ros.replay.topics import TopicNames
 
 LARGEST_PUSH = 1024
@@ -53,11 +52,7 @@ class Feed:
         self.first_stamp: int | None = None
         self.imu_count = 0
         self.withheld = {kind.stream: 0 for kind in topics.inputs}
-        self._pushes: dict[Stream, Callable[..., None]] = {
-            kind.stream: partial(navigator.push, kind.stream) for kind in topics.inputs
-        }
-        self._pushes[Stream.GNSS_POSITION] = navigator.push_gnss_position
-        self._pushes[Stream.GNSS_VELOCITY] = navigator.push_gnss_velocity
+        self._pushes = {kind.stream: kind.push_of(navigator) for kind in topics.inputs}
 
     def ordered(self, batches: Iterable[dict[str, Batch]]) -> Iterable[dict[str, Batch]]:
         """The batches as they have to be pushed."""

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from eskf_ros.bags import open_bag
 from eskf_ros.filter.layout import ODOMETRY
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.inputs import FIX
 from eskf_ros.parameters import Parameters
 from eskf_ros.replay.feed import Feed
-from eskf_ros.replay.inputs import FIX
 from eskf_ros.replay.results import ResultFiles, selected
 from eskf_ros.replay.summary import Summary, truth_result
 from eskf_ros.replay.topics import find_topics, truth_converter

@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from eskf_ros.bags import BagReader, Batch
 from eskf_ros.filter.layout import Stream
+from eskf_ros.inputs import FIX, INPUTS, ODOMETRY, TWIST, Input
 from eskf_ros.parameters import Parameters, Topics
-from eskf_ros.replay.inputs import FIX, INPUTS, TWIST, Input
 from eskf_ros.replay.truth import epochs_from_fix, epochs_from_odometry
 from eskf_ros.simulate.map_frame import MapFrame
 
 IMU = "sensor_msgs/msg/Imu"
-ODOMETRY = "nav_msgs/msg/Odometry"
 
 
 class InputError(Exception):
@@ -48,7 +47,7 @@ def find_topics(reader: BagReader, bag: Path, names: Topics, truth: str) -> tupl
     """Find the topics of the parameters `names`, and the `truth` topic unless empty, in the recording.
 
     All but IMU and fix may be missing as long as their names are the defaults; a list of hints says what else could be
-    the GNSS velocity.
+    the GNSS velocity. Where an input can be of several types, the recording says which it is.
 
     Raises:
         InputError: another topic is missing, has no messages or the wrong type.
@@ -59,7 +58,8 @@ def find_topics(reader: BagReader, bag: Path, names: Topics, truth: str) -> tupl
         name, remedy = getattr(names, kind.name), f"set topics.{kind.name} in --config FILE"
         is_required = kind.stream == Stream.GNSS_POSITION or name != getattr(Topics(), kind.name)
         if is_required or _find(reader, name):
-            inputs[kind] = _require(reader, bag, name, (kind.type,), remedy)
+            topic = _require(reader, bag, name, kind.types, remedy)
+            inputs[kind.of_type(reader.topics[topic].type)] = topic
     hints = [] if any(kind.stream == Stream.GNSS_VELOCITY for kind in inputs) else _velocity_hint(reader, names, inputs)
     if not truth:
         return TopicNames(imu, inputs), hints
