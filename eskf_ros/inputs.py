@@ -20,9 +20,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.bags import Batch
+from eskf_ros.bags import POINT_CLOUD, Batch
 from eskf_ros.filter.layout import Stream
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.ranges.intake import RangeIntake
 
 Arguments = Iterable[tuple[Any, ...]]
 Converter = Callable[[Batch], Arguments]
@@ -36,7 +37,8 @@ class Input:
 
     ``arguments`` turns a batch into those of the push of this stream, one tuple per message that begins with the stamp
     (ns). ``others``: further types that say the same, with what makes arguments of them. ``push``: the method of
-    `Navigator` that takes the arguments; empty: `Navigator.push`, with the stream. ``is_gnss``: withheld in an outage.
+    `Navigator`, or of `RangeIntake`, that takes the arguments; empty: `Navigator.push`, with the stream. ``is_gnss``:
+    withheld in an outage.
     ``by_receiver``: two receivers may share the topic, told apart by the frame. ``depth``: messages that may wait in
     the node while the computer is busy elsewhere, a second of a fast sensor.
     """
@@ -61,9 +63,12 @@ class Input:
         converters = {self.type: self.arguments, **dict(self.others)}
         return dataclasses.replace(self, type=name, arguments=converters[name], others=())
 
-    def push_of(self, navigator: Navigator) -> Callable[..., None]:
-        """What takes the arguments."""
-        return getattr(navigator, self.push) if self.push else partial(navigator.push, self.stream)  # type: ignore[no-any-return]
+    def push_of(self, navigator: Navigator, intake: RangeIntake | None = None) -> Callable[..., Any]:
+        """What takes the arguments: the navigator, or for ranges and ephemerides their intake."""
+        if not self.push:
+            return partial(navigator.push, self.stream)
+        taker: Callable[..., Any] = getattr(intake if self.name in RANGES else navigator, self.push)
+        return taker
 
 
 def _listed(column: NDArray[Any]) -> list[Any]:
@@ -154,6 +159,11 @@ def _pressures(batch: Batch) -> Arguments:
     return _vectors(batch, values, covariances)
 
 
+def _clouds(batch: Batch) -> Arguments:
+    messages = batch.messages
+    return zip(messages["stamp"].tolist(), messages["points"], batch.log_time.tolist(), strict=True)
+
+
 FIX = "sensor_msgs/msg/NavSatFix"
 ODOMETRY = "nav_msgs/msg/Odometry"
 TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
@@ -191,6 +201,11 @@ INPUTS = (
         _body_velocities,
         ((BARE_TWIST, _body_velocities), (ODOMETRY, _body_velocities)),
     ),
+    Input("ephemerides", Stream.PSEUDORANGE, POINT_CLOUD, _clouds, push="take_ephemerides", depth=50),
+    Input("ranges", Stream.PSEUDORANGE, POINT_CLOUD, _clouds, push="take_ranges", is_gnss=True, depth=50),
     Input("baro", Stream.BARO, "sensor_msgs/msg/FluidPressure", _pressures),
 )
 """All but the IMU. The order is that of messages with one log time."""
+
+FIXES = ("gnss_fix", "gnss_velocity")
+RANGES = ("ranges", "ephemerides")

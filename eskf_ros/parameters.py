@@ -142,6 +142,25 @@ class Topics:
         "nav_msgs/msg/Odometry",
     )
     baro: str = _parameter("baro", "", "sensor_msgs/FluidPressure: air pressure.", **_TOPIC)
+    ranges: str = _parameter(
+        "gnss/ranges",
+        "",
+        "sensor_msgs/PointCloud2: what the receiver measures of each satellite, one point per signal (mode tight).",
+        **_TOPIC,
+    )
+    ephemerides: str = _parameter(
+        "gnss/ephemerides",
+        "",
+        "sensor_msgs/PointCloud2: orbits and clocks of the satellites, one point per broadcast ephemeris.",
+        **_TOPIC,
+    )
+    initial_pose: str = _parameter(
+        "initialpose",
+        "",
+        "geometry_msgs/PoseWithCovarianceStamped in frames.map: puts the estimate there, as RViz's tool does. Position "
+        "and yaw are taken over; a height without variance is not. The replay does not read it.",
+        **_TOPIC,
+    )
 
 
 @dataclass(frozen=True)
@@ -531,6 +550,104 @@ class Baro(Aid):
 
 
 @dataclass(frozen=True)
+class Ranges(Aid):
+    use: bool = _parameter(
+        True,
+        "",
+        "Fuse the pseudoranges of topics.ranges in mode tight.",
+        live=True,
+    )
+    use_doppler: bool = _parameter(True, "", "Fuse the Doppler of topics.ranges in mode tight.", live=True)
+    time_offset: float = _parameter(
+        0.0,
+        "s",
+        "Added to the stamps: true time = stamp + offset. RINEX files are stamped with UTC: -18 or 18 s may be missing "
+        "where a recording is stamped with GPS time.",
+        minimum=-100.0,
+        maximum=100.0,
+    )
+    gate_probability: float = _parameter(
+        0.99994,
+        "",
+        "Gate of each signal: the share of good measurements that passes; 0.99994 is four standard deviations. From "
+        "2.5 on they are weighed down.",
+        above=0.0,
+        below=1.0,
+        live=True,
+    )
+    code_std_floor: float = _parameter(
+        0.3,
+        "m",
+        "The standard deviation of a pseudorange is never taken smaller than this.",
+        above=0.0,
+        maximum=1000.0,
+        live=True,
+    )
+    range_rate_std_floor: float = _parameter(
+        0.03,
+        "m/s",
+        "The standard deviation of a range rate (Doppler) is never taken smaller than this.",
+        above=0.0,
+        maximum=100.0,
+        live=True,
+    )
+    elevation_mask_deg: float = _parameter(
+        10.0, "deg", "Satellites below this elevation are not used.", minimum=-90.0, maximum=90.0, live=True
+    )
+    cn0_mask: float = _parameter(
+        28.0,
+        "dB-Hz",
+        "Signals whose carrier-to-noise density is below this are not used; an unknown one passes.",
+        minimum=0.0,
+        maximum=60.0,
+        live=True,
+    )
+    clock_drift_noise: float = _parameter(
+        0.3,
+        "m/s/rts",
+        "How fast the drift of the receiver's clock wanders: by this value times the square root of the seconds "
+        "passed. 0.1 geodetic receiver, 0.3 usual, 0.6 hand-held or shaken. Too small makes one or two satellites "
+        "worse than none.",
+        minimum=0.0,
+        maximum=1.0e3,
+        live=True,
+    )
+    clock_bias_noise: float = _parameter(
+        0.1,
+        "m/rts",
+        "How fast the bias of the receiver's clock wanders besides its drift.",
+        minimum=0.0,
+        maximum=1.0e3,
+        live=True,
+    )
+    inter_system_std: float = _parameter(
+        10.0,
+        "m",
+        "Standard deviation of the offset between a constellation and GPS in the receiver at first.",
+        above=0.0,
+        maximum=1.0e4,
+    )
+    inter_system_std_glonass: float = _parameter(30.0, "m", "The same for GLONASS.", above=0.0, maximum=1.0e4)
+    inter_system_noise: float = _parameter(
+        0.02, "m/rts", "How fast these offsets wander.", minimum=0.0, maximum=100.0, live=True
+    )
+    use_point_solution: bool = _parameter(
+        False,
+        "",
+        "In mode loose: solve each epoch of topics.ranges for position and velocity, and fuse these instead of the "
+        "receiver's own fixes.",
+    )
+    rinex_nav_files: str = _parameter(
+        "",
+        "",
+        "RINEX navigation files with the orbits and clocks of the satellites, separated by colons. Empty: they come "
+        "by topics.ephemerides, or topics.ranges brings the satellites itself.",
+        pattern=r"[^\0]*",
+        pattern_text="paths separated by colons, or nothing",
+    )
+
+
+@dataclass(frozen=True)
 class Zupt:
     enabled: bool = _parameter(
         False, "", "While the vehicle stands still, hold velocity and turn rate at zero.", live=True
@@ -789,6 +906,13 @@ class Parameters:
         minimum=(-90.0, -180.0, -1.0e4),
         maximum=(90.0, 180.0, 1.0e6),
     )
+    mode: str = _choice(
+        "loose",
+        "How GNSS is used. loose: the receiver's position and velocity (topics.gnss_fix, topics.gnss_velocity). tight: "
+        "each satellite's pseudorange and Doppler (topics.ranges) in place of the first receiver's fixes; below four "
+        "satellites the estimate then degrades gradually.",
+        "tight",
+    )
     imu: Imu = _group(Imu, "Where the IMU sits and how good it is; biases and noise are in the axes of the IMU.")
     gnss: Gnss = _group(Gnss, "The GNSS receiver: where its antenna sits and how far its messages are trusted.")
     second_gnss: SecondGnss = _group(
@@ -799,6 +923,7 @@ class Parameters:
     wheel: Wheel = _group(Wheel, "Wheel odometry.")
     body_velocity: BodyVelocity = _group(BodyVelocity, "Velocity in the axes of the vehicle.")
     baro: Baro = _group(Baro, "Barometer.")
+    ranges: Ranges = _group(Ranges, "What a GNSS receiver measures of each satellite: pseudorange and Doppler.")
     zupt: Zupt = _group(Zupt, "Standing still.")
     nhc: Nhc = _group(Nhc, "Non-holonomic constraint.")
     estimate: Estimate = _group(Estimate, "What is estimated besides the motion and the biases of the IMU.")

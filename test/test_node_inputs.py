@@ -57,7 +57,7 @@ def arguments_in_a_recording(kind: Any, type_name: str, data: bytes, arrival: in
 
 
 def same(a: Any, b: Any) -> bool:
-    return np.array_equal(a, b) if isinstance(a, np.ndarray) else type(a) is type(b) and a == b
+    return np.array_equal(a, b, equal_nan=True) if isinstance(a, np.ndarray) else type(a) is type(b) and a == b
 
 
 @needs_ros

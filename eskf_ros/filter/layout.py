@@ -14,6 +14,7 @@ from enum import IntEnum
 import numpy as np
 
 from eskf_ros.compiled import COMPILED
+from eskf_ros.gnss.signals import BEIDOU_3, Gnss
 
 # Error state: first index of each block of three. These 15 are the core; every robot has them.
 POSITION = 0
@@ -23,8 +24,23 @@ ACCEL_BIAS = 9
 GYRO_BIAS = 12
 ERROR_SIZE = 15
 
-OPTIONAL_SIZES = {"position_error": 3, "mounting": 2, "wheel_scale": 1, "baro_offset": 1, "baro_scale": 1}
-"""Optional errors behind the core, and how many each is: see ``optional``."""
+OPTIONAL_SIZES = {
+    "position_error": 3,
+    "mounting": 2,
+    "wheel_scale": 1,
+    "clock": 2,
+    "inter_system": 6,
+    "baro_offset": 1,
+    "baro_scale": 1,
+}
+"""Optional errors behind the core, and how many each is: see ``optional``.
+
+``clock``: of the receiver, bias (m) and drift (m/s). ``inter_system``: by what the ranges of a constellation are longer
+than those of GPS (m), in the order of `INTER_SYSTEM`.
+"""
+
+INTER_SYSTEM = (Gnss.GALILEO, BEIDOU_3, Gnss.GLONASS, Gnss.QZSS, Gnss.BEIDOU, Gnss.SBAS)
+"""The constellations but GPS (`gnss.signals.time_group`), the most usual first: a state joins with those before it."""
 
 OPTIONAL_CAPACITY = sum(OPTIONAL_SIZES.values())
 ERROR_CAPACITY = ERROR_SIZE + OPTIONAL_CAPACITY
@@ -97,8 +113,9 @@ class Verdict(IntEnum):
     DISABLED = 11
     WEIGHED_DOWN = 12
     INACTIVE = 13
-    CONTRADICTED = 14
-    RESET = 15
+    LOW_ELEVATION = 14
+    CONTRADICTED = 15
+    RESET = 16
 
 
 class Stream(IntEnum):
@@ -238,6 +255,11 @@ STATE = np.dtype(
         ("absolute_interval", "i8"),
         ("rejected_fixes", "i8"),
         ("restarts", "i8"),
+        # Tight coupling: whether the errors of clock bias and drift have values yet, milliseconds it has jumped by,
+        # and how often most of the satellites contradicted the state.
+        ("clock_known", "i8", (2,)),
+        ("clock_jumps", "i8"),
+        ("range_faults", "i8"),
         # Recovery, by stream and source: last measurement and the usual interval, last accepted one and since when they
         # are, rejected in a row.
         ("aid_stamp", "i8", (SENSOR_STREAMS, SOURCES)),
@@ -273,7 +295,7 @@ STATE = np.dtype(
 
 IMU = np.dtype([("stamp", "i8"), ("specific_force", "f8", (3,)), ("angular_rate", "f8", (3,))], align=True)
 
-PAYLOAD_SIZE = 16
+PAYLOAD_SIZE = 21
 AID = np.dtype(
     [
         ("stamp", "i8"),
@@ -365,6 +387,11 @@ SETTINGS = np.dtype(
         ("nhc_vertical_std", "f8"),
         ("nhc_angle_std", "f8"),
         ("nhc_slip", "f8"),
+        # Ranges: lowest elevation (rad), factor on variances, floors (m, m/s).
+        ("elevation_mask", "f8"),
+        ("range_covariance_scale", "f8"),
+        ("code_std_floor", "f8"),
+        ("range_rate_std_floor", "f8"),
         ("gate", "f8", (len(Stream), 4)),
         ("reach", "i8", (len(Stream),)),
         ("constrains", "i8", (len(Stream),)),
@@ -419,6 +446,9 @@ LOCAL = np.dtype(
 )
 """Pose of the IMU in `odom` (m, rad) and the variances it has gathered since the start (per axis)."""
 
+LARGEST_EPOCH = 256
+"""So many signals of an epoch are looked at together."""
+
 WORK = np.dtype(
     [
         ("half", "f8", (ACCEL_BIAS, ERROR_SIZE)),
@@ -431,6 +461,20 @@ WORK = np.dtype(
         ("gain", "f8", (ERROR_CAPACITY, 3)),
         ("residual_gain", "f8", (ERROR_CAPACITY, 3)),
         ("correction", "f8", (ERROR_CAPACITY,)),
+        # The signals of one epoch, and their least squares (see ``ranges``).
+        ("signal_count", "i8"),
+        ("signal_index", "i8", (LARGEST_EPOCH,)),
+        ("signal_innovation", "f8", (LARGEST_EPOCH,)),
+        ("signal_spread", "f8", (LARGEST_EPOCH,)),
+        ("signal_noise", "f8", (LARGEST_EPOCH,)),
+        ("signal_direction", "f8", (LARGEST_EPOCH, 3)),
+        ("signal_weight", "f8", (LARGEST_EPOCH,)),
+        ("signal_residual", "f8", (LARGEST_EPOCH,)),
+        ("signal_square", "f8", (LARGEST_EPOCH,)),
+        ("sorted", "f8", (LARGEST_EPOCH,)),
+        ("normal", "f8", (4, 4)),
+        ("right", "f8", (4,)),
+        ("step", "f8", (4,)),
     ],
     align=True,
 )

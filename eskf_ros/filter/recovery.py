@@ -38,6 +38,7 @@ from eskf_ros.filter.update import project, update
 GNSS_POSITION = int(Stream.GNSS_POSITION)
 GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
 BARO = int(Stream.BARO)
+PSEUDORANGE = int(Stream.PSEUDORANGE)
 
 FUSED = int(Verdict.FUSED)
 GATE = int(Verdict.GATE)
@@ -148,6 +149,14 @@ def recover(state, aid, size, gate, settings, work):
 
 
 @njit
+def note_epoch(state, verdict):
+    """Note what became of most pseudoranges of an epoch."""
+    note(state, PSEUDORANGE, 0, verdict)
+    if is_lost(state):
+        restart(state)
+
+
+@njit
 def update_weighed_down(state, size, excess, work):
     """Fuse what ``work`` describes with so much more noise that its NIS, ``excess`` gates, is on the gate."""
     project(state, size, work)
@@ -170,7 +179,7 @@ def note(state, stream, source, verdict):
             state.aid_fused_since[stream, source] = state.stamp
         state.aid_fused_stamp[stream, source] = state.stamp
         state.aid_rejected[stream, source] = 0
-        if stream == GNSS_POSITION:
+        if stream in (GNSS_POSITION, PSEUDORANGE):
             if state.absolute_stamp != NEVER:
                 state.absolute_interval = state.stamp - state.absolute_stamp
             state.absolute_stamp = state.stamp
@@ -179,8 +188,9 @@ def note(state, stream, source, verdict):
                 state.track_rejected[k] = 0
     else:
         state.aid_rejected[stream, source] += 1
-        if stream == GNSS_POSITION:
+        if stream in (GNSS_POSITION, PSEUDORANGE):
             state.rejected_fixes += 1
+        if stream == GNSS_POSITION:
             if verdict == CONTRADICTED:
                 state.track_rejected[source] = 0
             elif state.track_misses[source] == 0:

@@ -9,8 +9,18 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtri
 
-from eskf_ros.filter.layout import CONSTRAINTS, ERROR_SIZE, NOWHERE, OPTIONAL_SIZES, SETTINGS, Stream, allocate
+from eskf_ros.filter.layout import (
+    CONSTRAINTS,
+    ERROR_SIZE,
+    INTER_SYSTEM,
+    NOWHERE,
+    OPTIONAL_SIZES,
+    SETTINGS,
+    Stream,
+    allocate,
+)
 from eskf_ros.filter.strapdown import SECOND
+from eskf_ros.gnss.signals import Gnss
 from eskf_ros.parameters import Aid, Parameters
 from eskf_ros.rotation import from_roll_pitch_yaw, to_matrix
 
@@ -30,6 +40,11 @@ UNKNOWN_ANGLE_VARIANCE = 1.0
 """Angles are in rad; drivers say with a variance like 1000 or pi^2 that they do not know one (rad2)."""
 
 CONSTRAINT_GATE_PROBABILITY = 0.999
+
+START_CLOCK_STD = (1000.0, 1000.0)
+"""Of a receiver clock (m, m/s) whose first value is the median of the satellites."""
+
+Deviation = float | tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -129,6 +144,7 @@ def gate_probabilities(parameters: Parameters) -> dict[Stream, float]:
         Stream.WHEEL: parameters.wheel.gate_probability,
         Stream.BODY_VELOCITY: parameters.body_velocity.gate_probability,
         Stream.BARO: parameters.baro.gate_probability,
+        **dict.fromkeys((Stream.PSEUDORANGE, Stream.RANGE_RATE), parameters.ranges.gate_probability),
         **dict.fromkeys(CONSTRAINTS, CONSTRAINT_GATE_PROBABILITY),
     }
 
@@ -163,6 +179,10 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
     settings["constrains"][0, Stream.NHC] = parameters.nhc.enabled
     settings["correlated_share"] = parameters.gnss.correlated_share
     describe_vehicle(settings[0], parameters)
+    settings["elevation_mask"] = math.radians(parameters.ranges.elevation_mask_deg)
+    settings["range_covariance_scale"] = parameters.ranges.covariance_scale
+    settings["code_std_floor"] = parameters.ranges.code_std_floor
+    settings["range_rate_std_floor"] = parameters.ranges.range_rate_std_floor
     place_optional_states(settings[0], parameters)
     settings["static_duration"] = alignment.static_duration
     settings["moving_start_after"] = alignment.moving_start_after
@@ -194,17 +214,24 @@ def describe_vehicle(settings: np.void, parameters: Parameters) -> None:
 
 
 def place_optional_states(settings: np.void, parameters: Parameters) -> None:
-    """Give the optional states that are switched on their places and their models, and the streams their reach."""
+    """Give the optional states that are switched on their places and their models, and the streams their reach.
+
+    The offsets of the constellations join one by one, with the first signal of each (`ranges`).
+    """
     settings["reach"] = end = ERROR_SIZE
     time, baro = parameters.gnss.correlation_time, parameters.baro
     estimate = parameters.estimate
     mounting_std, mounting_walk = math.radians(estimate.mounting_std_deg), estimate.mounting_random_walk
     scale_std, scale_walk = estimate.wheel_scale_std, estimate.wheel_scale_random_walk
+    ranges, is_tight = parameters.ranges, parameters.mode == "tight"
+    clock_noise = (ranges.clock_bias_noise, ranges.clock_drift_noise)
     # Name, whether it is on, first deviation, driving noise, correlation time (0: random walk), streams that need it.
-    blocks: tuple[tuple[str, bool, float, float, float, tuple[Stream, ...]], ...] = (
+    blocks: tuple[tuple[str, bool, Deviation, Deviation, float, tuple[Stream, ...]], ...] = (
         ("position_error", time > 0.0, 1.0, math.sqrt(2.0 / time) if time else 0.0, time, (Stream.GNSS_POSITION,)),
         ("mounting", estimate.mounting, mounting_std, mounting_walk, 0.0, (Stream.NHC, Stream.WHEEL)),
         ("wheel_scale", estimate.wheel_scale, scale_std, scale_walk, 0.0, (Stream.WHEEL,)),
+        ("clock", is_tight, START_CLOCK_STD, clock_noise, 0.0, (Stream.PSEUDORANGE, Stream.RANGE_RATE)),
+        ("inter_system", is_tight, inter_system_stds(parameters), ranges.inter_system_noise, 0.0, ()),
         # Not by whether it is used, which may change while running: places stay.
         ("baro_offset", True, baro.offset_std, baro.offset_random_walk, 0.0, (Stream.BARO,)),
         ("baro_scale", True, baro.scale_std, 0.0, 0.0, (Stream.BARO,)),
@@ -220,3 +247,12 @@ def place_optional_states(settings: np.void, parameters: Parameters) -> None:
         end += OPTIONAL_SIZES[name]
         for stream in streams:
             settings["reach"][stream] = end
+
+
+def inter_system_stds(parameters: Parameters) -> tuple[float, ...]:
+    """Return the standard deviation (m) of each of the `INTER_SYSTEM` offsets at first."""
+    ranges = parameters.ranges
+    return tuple(
+        ranges.inter_system_std_glonass if system == Gnss.GLONASS else ranges.inter_system_std
+        for system in INTER_SYSTEM
+    )

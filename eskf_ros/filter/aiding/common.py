@@ -131,6 +131,7 @@ def horizontal_acceleration(state, rotation, force):
     return math.sqrt((a[0] - along * g[0]) ** 2 + (a[1] - along * g[1]) ** 2 + (a[2] - along * g[2]) ** 2)
 
 
+@njit
 def to_local(state, local_to_ecef, direction_body):
     """Return a direction of the body in the axes whose rotation to ECEF is given (East-North-Up at its place)."""
     direction_map = rotate(to_matrix(state.attitude), direction_body)
