@@ -60,7 +60,7 @@ from eskf_ros.filter.layout import (
 )
 from eskf_ros.filter.local import note_jump
 from eskf_ros.filter.optional import join, renew
-from eskf_ros.filter.recovery import judge_filter
+from eskf_ros.filter.recovery import note_epoch
 from eskf_ros.filter.timeline import insert_aid, open_record
 from eskf_ros.filter.update import invert_positive, project, update
 from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, Status
@@ -214,9 +214,9 @@ def fuse_ranges(state, aids, first, end, settings, work):
             if aids[i].verdict != GATE:
                 fused += 1
     if which == 0 and fused >= FEWEST_TO_SOLVE:
-        judge_filter(state, FUSED)
+        note_epoch(state, FUSED)
     elif which == 0 and work.signal_count >= FEWEST_TO_JUDGE and 2 * fused < work.signal_count:
-        judge_filter(state, GATE)
+        note_epoch(state, GATE)
     note_jump(state, position, heading, settings)
 
 
