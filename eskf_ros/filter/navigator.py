@@ -73,6 +73,7 @@ from eskf_ros.filter.timeline import (
 )
 from eskf_ros.filter.update import update
 from eskf_ros.filter.warm_start import Memory, recall
+from eskf_ros.filter.wheel_heading import search_with_wheels
 from eskf_ros.gnss.measurements import MEASURED_SIGNAL
 from eskf_ros.gnss.range_model import NO_KLOBUCHAR
 from eskf_ros.gnss.ranges import Status as RangeStatus
@@ -106,6 +107,9 @@ IMU_BATCH = 1024
 
 HIGHEST_ALTITUDE = 1e5
 """What no receiver on a robot reports (m)."""
+
+ORIENTATION_SHARE = SECOND // 20
+"""Of each second so much (ns) of what the IMU says of its orientation is used."""
 
 DIAGONAL = np.eye(3).ravel()
 
@@ -204,6 +208,9 @@ def fuse(state, aids, i, settings, work):
         note_velocity(state, aid, settings)
         watch_course(state, aid, heading_of(state, settings), settings)
     if not is_aligned_for(state, aid.stream):
+        if aid.stream == WHEEL:
+            search_with_wheels(state, aid.payload, settings.gate[WHEEL, 2], settings, work)
+            watch_wheels(state, aid)
         aid.verdict = BEFORE_ALIGNMENT if aid.stream < FIRST_CONSTRAINT else INACTIVE
         return
     if aid.stream == HEADING and aid.source == heading.IMU_ORIENTATION and state.heading_known == 1:
@@ -346,7 +353,6 @@ class Navigator:
         self.range_statuses: Counter[RangeStatus] = Counter()
         """What became of the signals before they entered the timeline: how many are usable, and why others are not."""
         self._field_problem = ""
-        self._orientation_second = -1
 
     def warm_start(self, memory: Memory, age: float) -> None:
         """Offer what an earlier run knew, ``age`` seconds ago; to be called before the first sample."""
@@ -555,7 +561,8 @@ class Navigator:
     def push_imu_orientation(self, stamps: StampArray, orientation: FloatArray, covariance: FloatArray) -> None:
         """Take what samples of `push_imu` say of the IMU's orientation: (n, 4) x y z w and (n, 9) rad2, as in REP-145.
 
-        Nothing happens unless ``alignment.imu_orientation`` asks for it; then one sample a second is enough.
+        Nothing happens unless ``alignment.imu_orientation`` asks for it; then the first few of each second are enough:
+        which these are must not depend on the order in which they come.
         """
         alignment = self.parameters.alignment
         if alignment.imu_orientation == "unused":
@@ -563,9 +570,8 @@ class Navigator:
         forward_imu = self._settings["imu_to_base"][0, 0]
         for i in np.flatnonzero(covariance[:, 0] != ABSENT):
             stamp = int(stamps[i])
-            if stamp // SECOND <= self._orientation_second:
+            if stamp % SECOND >= ORIENTATION_SHARE:
                 continue
-            self._orientation_second = stamp // SECOND
             x, y, z, w = (float(value) for value in orientation[i])
             yaw = math.nan
             if abs(x * x + y * y + z * z + w * w - 1.0) < 0.1:
@@ -733,7 +739,7 @@ class Navigator:
             found, inclination, strength = declination, 0.0, 0.0
         if math.isnan(declination):
             declination = found
-        self._offered[0]["payload"][mag.FIELD :] = (1.0, declination, inclination, strength)
+        self._offered[0]["payload"][mag.FIELD : mag.FIELD + 4] = (1.0, declination, inclination, strength)
 
     def _push_gnss(self, stream: Stream, stamp: int, arrival: int, frame_id: str) -> None:
         """Sort the record that is on offer into the timeline, as one of the receiver with this frame."""
@@ -751,6 +757,8 @@ class Navigator:
         aid = self._offered[0]
         aid["source"] = source
         aid["stamp"], aid["arrival"], aid["stream"], aid["verdict"] = stamp, arrival, stream, aid["door"]
+        # So it stays in the record of a measurement that waits in vain.
+        aid["dof"], aid["nis"], aid["innovation"] = 0, math.nan, math.nan
         self._make_room()
         refused = insert_aid(self._aids, self._timeline, self._offered)
         if refused:

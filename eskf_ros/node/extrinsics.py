@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from eskf_ros.parameters import Parameters, to_mapping
 
-Pose = tuple[np.ndarray, Rotation]
-"""Position (3,) m and orientation of a frame in another."""
+Pose = tuple[np.ndarray, np.ndarray]
+"""Position (3,) m and rotation matrix (3, 3) of a frame in another."""
 
 IMU, ANTENNA, SECOND_ANTENNA = "IMU", "GNSS antenna", "second GNSS antenna"
 
@@ -72,7 +72,7 @@ class Extrinsics:
         position = np.array([t.x, t.y, t.z])
         norm = np.linalg.norm(quaternion)
         if np.isfinite(position).all() and 0.5 < norm < 2.0:
-            pose = position, Rotation.from_quat(quaternion / norm)
+            pose = position, matrix_of(*(quaternion / norm))
             self._parents[message.child_frame_id] = message.header.frame_id, pose
 
     def note_frame(self, sensor: str, frame: str) -> None:
@@ -88,8 +88,9 @@ class Extrinsics:
                 if pose is None or sensor in self._found:
                     continue
                 self._found[sensor] = pose
-                place = " ".join(f"{value:.3f}" for value in pose[0])
-                angles = " ".join(f"{value:.2f}" for value in pose[1].as_euler("xyz", degrees=True))
+                # Plus zero: no sign on a zero.
+                place = " ".join(f"{value:.3f}" for value in np.round(pose[0], 3) + 0.0)
+                angles = " ".join(f"{value:.2f}" for value in np.round(roll_pitch_yaw_deg(pose[1]), 2) + 0.0)
                 lines.append(
                     f"{sensor} in {self._base_link}, from /tf_static by its frame {frame}: "
                     f"position {place} m, roll pitch yaw {angles} deg"
@@ -101,7 +102,7 @@ class Extrinsics:
         for sensor, (position, rotation) in self._found.items():
             parameters = _changed(parameters, PLACES[sensor].position, position)
             if PLACES[sensor].rotation:
-                parameters = _changed(parameters, PLACES[sensor].rotation, rotation.as_euler("xyz", degrees=True))
+                parameters = _changed(parameters, PLACES[sensor].rotation, roll_pitch_yaw_deg(rotation))
         return parameters
 
     def source_of(self, sensor: str) -> str:
@@ -116,18 +117,18 @@ class Extrinsics:
         for name, (position, rotation) in self._ancestors(frame).items():
             if name in of_base:
                 base_position, base_rotation = of_base[name]
-                return base_rotation.inv().apply(position - base_position), base_rotation.inv() * rotation
+                return base_rotation.T @ (position - base_position), base_rotation.T @ rotation
         return None
 
     def _ancestors(self, frame: str) -> dict[str, Pose]:
         """The pose of a frame in itself, its parent, and so on upwards."""
-        pose: Pose = np.zeros(3), Rotation.identity()
+        pose: Pose = np.zeros(3), np.eye(3)
         found = {frame: pose}
         while frame in self._parents:
             frame, (position, rotation) = self._parents[frame]
             if frame in found:
                 break
-            pose = position + rotation.apply(pose[0]), rotation * pose[1]
+            pose = position + rotation @ pose[0], rotation @ pose[1]
             found[frame] = pose
         return found
 
@@ -136,3 +137,24 @@ def _changed(parameters: Parameters, name: str, values: np.ndarray) -> Parameter
     group, field = name.split(".")
     changed = dataclasses.replace(getattr(parameters, group), **{field: tuple(values.tolist())})
     return dataclasses.replace(parameters, **{group: changed})
+
+
+def matrix_of(x: float, y: float, z: float, w: float) -> np.ndarray:
+    """The rotation matrix of a unit quaternion."""
+    return np.array(
+        [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+    )
+
+
+def roll_pitch_yaw_deg(matrix: np.ndarray) -> np.ndarray:
+    """Roll, pitch and yaw (3,) of a rotation matrix, about fixed axes; pitch from -90 to 90 degrees."""
+    pitch = math.atan2(-matrix[2, 0], math.hypot(matrix[2, 1], matrix[2, 2]))
+    if math.hypot(matrix[2, 1], matrix[2, 2]) < 1e-9:
+        # Straight up or down: roll and yaw turn about the same axis, and all of it is called yaw.
+        return np.degrees([0.0, pitch, math.atan2(-matrix[0, 1], matrix[1, 1])])
+    roll, yaw = math.atan2(matrix[2, 1], matrix[2, 2]), math.atan2(matrix[1, 0], matrix[0, 0])
+    return np.degrees([roll, pitch, yaw])
