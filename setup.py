@@ -19,7 +19,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
         (f"share/{package_name}", ["package.xml"]),
         (f"share/{package_name}/config", sorted(glob("config/*.yaml"))),
-        (f"share/{package_name}/bags", sorted(glob("bags/*.mcap"))),
+        (f"share/{package_name}/bags", sorted(glob("bags/*.mcap") + glob("bags/*.nav"))),
         (f"share/{package_name}/launch", sorted(glob("launch/*.launch.py"))),
     ],
     python_requires=">=3.10",
@@ -42,11 +42,14 @@ setup(
             "ros-jazzy-common-interfaces; sys_platform == 'linux' and platform_machine == 'x86_64'",
             "ros-rclpy[fastrtps]==7.1.6; sys_platform == 'linux' and platform_machine == 'x86_64'",
         ],
+        # The World Magnetic Model, for the declination that a magnetometer needs; MIT, 0.3 MB, without dependencies.
+        "mag": ["pygeomag"],
         "test": [
             "matplotlib",
             "gtsam",
             "hypothesis",
             "mypy",
+            "pygeomag",
             "pymap3d",
             # Independent GNSS libraries, wheels for Linux on x86-64; without them these comparisons are skipped.
             "pyrtklib5; sys_platform == 'linux' and platform_machine == 'x86_64' and python_version < '3.13'",
@@ -59,6 +62,7 @@ setup(
         "console_scripts": [
             "eskf_node = eskf_ros.node.main:main",
             "eskf_replay = eskf_ros.replay.main:main",
+            "eskf_ranges = eskf_ros.ranges.main:main",
             "eskf_simulate = eskf_ros.simulate.main:main",
         ],
     },

@@ -11,6 +11,7 @@ entry in ``others`` and a choice of the parameter ``topics.NAME_type``.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
@@ -19,9 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.bags import Batch
+from eskf_ros.bags import POINT_CLOUD, Batch
 from eskf_ros.filter.layout import Stream
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.parameters import Parameters
+from eskf_ros.ranges.intake import RangeIntake
 
 Arguments = Iterable[tuple[Any, ...]]
 Converter = Callable[[Batch], Arguments]
@@ -35,9 +38,11 @@ class Input:
 
     ``arguments`` turns a batch into those of the push of this stream, one tuple per message that begins with the stamp
     (ns). ``others``: further types that say the same, with what makes arguments of them. ``push``: the method of
-    `Navigator` that takes the arguments; empty: `Navigator.push`, with the stream. ``is_gnss``: withheld in an outage.
+    `Navigator`, or of `RangeIntake`, that takes the arguments; empty: `Navigator.push`, with the stream. ``is_gnss``:
+    withheld in an outage.
     ``by_receiver``: two receivers may share the topic, told apart by the frame. ``depth``: messages that may wait in
-    the node while the computer is busy elsewhere, a second of a fast sensor.
+    the node while the computer is busy elsewhere, a second of a fast sensor. ``is_timed``: its stamps are instants of
+    measurements.
     """
 
     name: str
@@ -49,6 +54,7 @@ class Input:
     is_gnss: bool = False
     by_receiver: bool = False
     depth: int = 1000
+    is_timed: bool = True
 
     @property
     def types(self) -> tuple[str, ...]:
@@ -60,9 +66,12 @@ class Input:
         converters = {self.type: self.arguments, **dict(self.others)}
         return dataclasses.replace(self, type=name, arguments=converters[name], others=())
 
-    def push_of(self, navigator: Navigator) -> Callable[..., None]:
-        """What takes the arguments."""
-        return getattr(navigator, self.push) if self.push else partial(navigator.push, self.stream)  # type: ignore[no-any-return]
+    def push_of(self, navigator: Navigator, intake: RangeIntake | None = None) -> Callable[..., Any]:
+        """What takes the arguments: the navigator, or for ranges and ephemerides their intake."""
+        if not self.push:
+            return partial(navigator.push, self.stream)
+        taker: Callable[..., Any] = getattr(intake if self.name in RANGES else navigator, self.push)
+        return taker
 
 
 def _listed(column: NDArray[Any]) -> list[Any]:
@@ -104,7 +113,7 @@ def _vectors(batch: Batch, values: NDArray[Any], covariances: NDArray[Any]) -> A
 
 
 def _headings(batch: Batch) -> Arguments:
-    """Yaw (0 = east, counter-clockwise) and pitch (down is positive) of an orientation."""
+    """Yaw (0 = east, counter-clockwise) and pitch (down is positive) of an orientation, if there is one (REP-145)."""
     messages = batch.messages
     x, y, z, w = messages["orientation"].T
     values, covariances = np.zeros((len(messages), 3)), np.zeros((len(messages), 9))
@@ -113,6 +122,8 @@ def _headings(batch: Batch) -> Arguments:
     given = messages["orientation_covariance"]
     covariances[:, 0], covariances[:, 4] = given[:, 8], given[:, 4]
     covariances[given.any(axis=1), 8] = UNMEASURED
+    covariances[given[:, 0] == UNMEASURED] = UNMEASURED
+    values[np.abs(x * x + y * y + z * z + w * w - 1.0) > 0.1] = math.nan
     return _vectors(batch, values, covariances)
 
 
@@ -149,6 +160,11 @@ def _pressures(batch: Batch) -> Arguments:
     covariances[:, 0] = messages["variance"]
     covariances[messages["variance"] != 0.0, 4::4] = UNMEASURED
     return _vectors(batch, values, covariances)
+
+
+def _clouds(batch: Batch) -> Arguments:
+    messages = batch.messages
+    return zip(messages["stamp"].tolist(), messages["points"], batch.log_time.tolist(), strict=True)
 
 
 FIX = "sensor_msgs/msg/NavSatFix"
@@ -188,6 +204,29 @@ INPUTS = (
         _body_velocities,
         ((BARE_TWIST, _body_velocities), (ODOMETRY, _body_velocities)),
     ),
+    Input("ephemerides", Stream.PSEUDORANGE, POINT_CLOUD, _clouds, push="take_ephemerides", depth=50, is_timed=False),
+    Input("ranges", Stream.PSEUDORANGE, POINT_CLOUD, _clouds, push="take_ranges", is_gnss=True, depth=50),
     Input("baro", Stream.BARO, "sensor_msgs/msg/FluidPressure", _pressures),
 )
 """All but the IMU. The order is that of messages with one log time."""
+
+FIXES = ("gnss_fix", "gnss_velocity")
+RANGES = ("ranges", "ephemerides")
+
+
+def inputs_of(parameters: Parameters) -> tuple[Input, ...]:
+    """The rows in use: either what a receiver solved or its ranges, never both."""
+    unused = FIXES if uses_ranges(parameters) else RANGES
+    return tuple(kind for kind in INPUTS if kind.name not in unused)
+
+
+def uses_ranges(parameters: Parameters) -> bool:
+    """Whether GNSS is used by its ranges."""
+    return parameters.mode == "tight" or parameters.ranges.use_point_solution
+
+
+def time_offset_of(kind: Input, parameters: Parameters) -> float:
+    """What is added to the stamps of an input (s)."""
+    group = "gnss" if kind.name in FIXES else "ranges" if kind.name in RANGES else kind.name
+    offset: float = getattr(parameters, group).time_offset
+    return offset

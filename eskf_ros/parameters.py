@@ -112,9 +112,13 @@ class Topics:
         "geometry_msgs/msg/TwistWithCovarianceStamped", _TYPE, "geometry_msgs/msg/TwistStamped"
     )
     heading: str = _parameter(
-        "gnss/heading", "", "sensor_msgs/Imu: yaw of a dual-antenna receiver, with its covariance.", **_TOPIC
+        "gnss/heading",
+        "",
+        "sensor_msgs/Imu of a dual-antenna receiver: yaw (0 = east, counter-clockwise) and pitch of the baseline; one "
+        "whose variance is above 1 rad2 is not used.",
+        **_TOPIC,
     )
-    mag: str = _parameter("imu/mag", "", "sensor_msgs/MagneticField: magnetometer in the frame of the IMU.", **_TOPIC)
+    mag: str = _parameter("imu/mag", "", "sensor_msgs/MagneticField: field in the axes of the magnetometer.", **_TOPIC)
     wheel: str = _parameter(
         "wheel/odom", "", "nav_msgs/Odometry: wheel odometry, of which speed and yaw rate are used.", **_TOPIC
     )
@@ -138,6 +142,18 @@ class Topics:
         "nav_msgs/msg/Odometry",
     )
     baro: str = _parameter("baro", "", "sensor_msgs/FluidPressure: air pressure.", **_TOPIC)
+    ranges: str = _parameter(
+        "gnss/ranges",
+        "",
+        "sensor_msgs/PointCloud2: what the receiver measures of each satellite, one point per signal (mode tight).",
+        **_TOPIC,
+    )
+    ephemerides: str = _parameter(
+        "gnss/ephemerides",
+        "",
+        "sensor_msgs/PointCloud2: orbits and clocks of the satellites, one point per broadcast ephemeris.",
+        **_TOPIC,
+    )
     initial_pose: str = _parameter(
         "initialpose",
         "",
@@ -389,6 +405,16 @@ class Aid:
 
 @dataclass(frozen=True)
 class Heading(Aid):
+    mount_rpy_deg: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0),
+        "deg",
+        "Orientation of the baseline in base_link, whose yaw and pitch the messages tell: roll, pitch, yaw about fixed "
+        "axes as in a URDF, of a frame whose x axis leads from the first antenna (of u-blox: the moving base) to the "
+        "second. [0.0, 0.0, 0.0]: the second is in front; [0.0, 0.0, 90.0]: it is on the left; [0.0, 0.0, 180.0]: it "
+        "is behind.",
+        minimum=-360.0,
+        maximum=360.0,
+    )
     std_floor_deg: float = _parameter(
         0.2, "deg", "The standard deviation is never taken smaller than this.", above=0.0, maximum=90.0, live=True
     )
@@ -406,6 +432,56 @@ class Mag(Aid):
         "misleads.",
         live=True,
     )
+    mount_rpy_deg: tuple[float, ...] = _parameter(
+        (),
+        "deg",
+        "Orientation of the magnetometer in base_link: roll, pitch, yaw about fixed axes as in a URDF. "
+        "Empty: its axes are those of the IMU.",
+        lengths=(0, 3),
+        minimum=-360.0,
+        maximum=360.0,
+    )
+    declination_deg: float = _parameter(
+        math.nan,
+        "deg",
+        "Angle from true north to magnetic north, east positive. .nan: from the World Magnetic Model for the place of "
+        "the fixes and the date of their stamps, for which the Python package pygeomag must be installed.",
+        minimum=-180.0,
+        maximum=180.0,
+        nan_allowed=True,
+    )
+    error_std_deg: float = _parameter(
+        4.0,
+        "deg",
+        "Standard deviation of the heading error that remains after calibration, by iron in the vehicle and nearby. It "
+        "does not average out while the vehicle stands.",
+        above=0.0,
+        maximum=180.0,
+    )
+    error_distance: float = _parameter(
+        50.0,
+        "m",
+        "Having travelled so far, or turned by one radian, the vehicle meets another such error.",
+        above=0.0,
+        maximum=1.0e6,
+    )
+    strength_tolerance: float = _parameter(
+        0.15,
+        "",
+        "A field is taken for disturbed where its strength differs by more than this part from that of the World "
+        "Magnetic Model. Without the model nothing is checked.",
+        above=0.0,
+        maximum=10.0,
+        live=True,
+    )
+    inclination_tolerance_deg: float = _parameter(
+        8.0,
+        "deg",
+        "The same for its inclination (dip).",
+        above=0.0,
+        maximum=180.0,
+        live=True,
+    )
     std_floor: float = _parameter(
         1.0e-6,
         "T",
@@ -421,6 +497,23 @@ class Mag(Aid):
 
 @dataclass(frozen=True)
 class Wheel(Aid):
+    position: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0),
+        "m",
+        "The point of base_link whose forward speed the wheels show: the middle of the axle they are on, or the place "
+        "of a single wheel.",
+        minimum=-1000.0,
+        maximum=1000.0,
+    )
+    slip: float = _parameter(
+        0.005,
+        "s2/m",
+        "Tyres slip by this share of the speed for every m/s2 of acceleration. The default is that of a car on dry "
+        "asphalt; loose ground takes several times as much.",
+        minimum=0.0,
+        maximum=1.0,
+        live=True,
+    )
     speed_std_floor: float = _parameter(
         0.05,
         "m/s",
@@ -467,11 +560,156 @@ class BodyVelocity(Aid):
 
 @dataclass(frozen=True)
 class Baro(Aid):
+    position: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0),
+        "m",
+        "Position of the barometer in base_link, x forward, y left, z up.",
+        minimum=-1000.0,
+        maximum=1000.0,
+    )
+    offset_std: float = _parameter(
+        300.0,
+        "m",
+        "Standard deviation at first of the difference between pressure altitude and height: weather and geoid. "
+        "It is estimated.",
+        above=0.0,
+        maximum=1.0e4,
+    )
+    offset_random_walk: float = _parameter(
+        0.1,
+        "m/s/rtHz",
+        "How fast that difference wanders, by weather, wind and warming up: by this value times the square root of the "
+        "seconds passed. The default is 6 m in one hour; more where air is blown about, as in a vehicle.",
+        minimum=0.0,
+        maximum=100.0,
+    )
+    scale_std: float = _parameter(
+        0.03,
+        "",
+        "Standard deviation of the factor by which pressure altitude grows faster or slower than height: 0.03 where "
+        "the air is 9 K warmer or colder than in the standard atmosphere. It is estimated.",
+        minimum=0.0,
+        maximum=1.0,
+    )
     std_floor: float = _parameter(
         3.0, "Pa", "The standard deviation is never taken smaller than this.", above=0.0, maximum=1.0e4, live=True
     )
     unknown_std: float = _parameter(
         10.0, "Pa", "Standard deviation where the message gives none.", above=0.0, maximum=1.0e4, live=True
+    )
+
+
+@dataclass(frozen=True)
+class Ranges(Aid):
+    use: bool = _parameter(
+        True,
+        "",
+        "Fuse the pseudoranges of topics.ranges in mode tight.",
+        live=True,
+    )
+    use_doppler: bool = _parameter(True, "", "Fuse the Doppler of topics.ranges in mode tight.", live=True)
+    time_offset: float = _parameter(
+        0.0,
+        "s",
+        "Added to the stamps: true time = stamp + offset. RINEX files are stamped with UTC: -18 or 18 s may be missing "
+        "where a recording is stamped with GPS time.",
+        minimum=-100.0,
+        maximum=100.0,
+    )
+    gate_probability: float = _parameter(
+        0.99994,
+        "",
+        "Gate of each signal: the share of good measurements that passes; 0.99994 is four standard deviations. From "
+        "2.5 on they are weighed down.",
+        above=0.0,
+        below=1.0,
+        live=True,
+    )
+    code_std_floor: float = _parameter(
+        0.3,
+        "m",
+        "The standard deviation of a pseudorange is never taken smaller than this.",
+        above=0.0,
+        maximum=1000.0,
+        live=True,
+    )
+    range_rate_std_floor: float = _parameter(
+        0.03,
+        "m/s",
+        "The standard deviation of a range rate (Doppler) is never taken smaller than this.",
+        above=0.0,
+        maximum=100.0,
+        live=True,
+    )
+    elevation_mask_deg: float = _parameter(
+        10.0, "deg", "Satellites below this elevation are not used.", minimum=-90.0, maximum=90.0, live=True
+    )
+    cn0_mask: float = _parameter(
+        28.0,
+        "dB-Hz",
+        "Signals whose carrier-to-noise density is below this are not used; an unknown one passes.",
+        minimum=0.0,
+        maximum=60.0,
+        live=True,
+    )
+    clock_drift_noise: float = _parameter(
+        0.3,
+        "m/s/rts",
+        "How fast the drift of the receiver's clock wanders: by this value times the square root of the seconds "
+        "passed. 0.1 geodetic receiver, 0.3 usual, 0.6 hand-held or shaken. Too small makes one or two satellites "
+        "worse than none.",
+        minimum=0.0,
+        maximum=1.0e3,
+        live=True,
+    )
+    clock_bias_noise: float = _parameter(
+        0.1,
+        "m/rts",
+        "How fast the bias of the receiver's clock wanders besides its drift.",
+        minimum=0.0,
+        maximum=1.0e3,
+        live=True,
+    )
+    correlation_time: float = _parameter(
+        60.0,
+        "s",
+        "How long the common error of the pseudoranges lasts (e-folding time): reflections, orbits, what the models "
+        "leave of the atmosphere. 0: not modelled, and the estimate then trusts the mean of many epochs too much.",
+        minimum=0.0,
+        maximum=1.0e5,
+    )
+    correlated_std: float = _parameter(
+        1.5,
+        "m",
+        "With a correlation_time: the standard deviation of a position, per axis, by errors that last.",
+        above=0.0,
+        maximum=1000.0,
+        live=True,
+    )
+    inter_system_std: float = _parameter(
+        10.0,
+        "m",
+        "Standard deviation of the offset between a constellation and GPS in the receiver at first.",
+        above=0.0,
+        maximum=1.0e4,
+    )
+    inter_system_std_glonass: float = _parameter(30.0, "m", "The same for GLONASS.", above=0.0, maximum=1.0e4)
+    inter_system_noise: float = _parameter(
+        0.02, "m/rts", "How fast these offsets wander.", minimum=0.0, maximum=100.0, live=True
+    )
+    use_point_solution: bool = _parameter(
+        False,
+        "",
+        "In mode loose: solve each epoch of topics.ranges for position and velocity, and fuse these instead of the "
+        "receiver's own fixes.",
+    )
+    rinex_nav_files: str = _parameter(
+        "",
+        "",
+        "RINEX navigation files with the orbits and clocks of the satellites, separated by colons. Empty: they come "
+        "by topics.ephemerides, or topics.ranges brings the satellites itself.",
+        pattern=r"[^\0]*",
+        pattern_text="paths separated by colons, or nothing",
     )
 
 
@@ -490,6 +728,92 @@ class Nhc:
         "For vehicles on wheels: they move neither sideways nor up and down at the rear axle (non-holonomic "
         "constraint).",
         live=True,
+    )
+    position: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0),
+        "m",
+        "The point of base_link that does not move sideways: the middle of the axle that does not steer, usually the "
+        "rear one.",
+        minimum=-1000.0,
+        maximum=1000.0,
+    )
+    lateral_std: float = _parameter(
+        0.05,
+        "m/s",
+        "Standard deviation of the lateral velocity, however slow the vehicle is.",
+        above=0.0,
+        maximum=100.0,
+        live=True,
+    )
+    vertical_std: float = _parameter(
+        0.1,
+        "m/s",
+        "The same of the vertical velocity: bumps and springs.",
+        above=0.0,
+        maximum=100.0,
+        live=True,
+    )
+    angle_std_deg: float = _parameter(
+        0.3,
+        "deg",
+        "How far the direction of travel differs from the axes of the vehicle on a straight road (camber, side wind), "
+        "as a standard deviation.",
+        minimum=0.0,
+        maximum=90.0,
+        live=True,
+    )
+    slip: float = _parameter(
+        0.01,
+        "rad s2/m",
+        "What acceleration adds to this angle, by side slip of the tyres in turns, and by springs, for every m/s2. The "
+        "default is about twice what a car shows, because these errors last for seconds.",
+        minimum=0.0,
+        maximum=1.0,
+        live=True,
+    )
+
+
+@dataclass(frozen=True)
+class Estimate:
+    wheel_scale: bool = _parameter(
+        True,
+        "",
+        "Estimate what the wheels multiply the speed with: nobody knows the radius of a tyre to a per mille.",
+    )
+    wheel_scale_std: float = _parameter(
+        0.03, "", "Standard deviation of the scale of the wheels at start.", above=0.0, maximum=1.0
+    )
+    wheel_scale_random_walk: float = _parameter(
+        5.0e-5,
+        "1/rtHz",
+        "How fast the scale of the wheels wanders with load and tyre pressure: by this value times the square root of "
+        "the seconds passed.",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    mounting: bool = _parameter(
+        True,
+        "",
+        "Estimate yaw and pitch of the direction in which the vehicle rolls against the x axis of base_link, where "
+        "wheels or nhc need it.",
+    )
+    mounting_std_deg: float = _parameter(
+        2.0, "deg", "Standard deviation of these angles at start.", above=0.0, maximum=45.0
+    )
+    magnetic_bias: bool = _parameter(
+        False,
+        "",
+        "Estimate the hard iron that turns with the magnetometer. It shows as the vehicle turns.",
+    )
+    magnetic_bias_std: float = _parameter(
+        3.0e-6, "T", "Standard deviation per axis of this field at start.", above=0.0, maximum=1.0e-3
+    )
+    mounting_random_walk: float = _parameter(
+        3.0e-5,
+        "rad/rtHz",
+        "How fast these angles wander with the load: by this value times the square root of the seconds passed.",
+        minimum=0.0,
+        maximum=1.0,
     )
 
 
@@ -555,6 +879,21 @@ class Alignment:
         "direction the vehicle moves. It counts as known when its standard deviation falls below this.",
         above=0.0,
         maximum=30.0,
+    )
+    imu_orientation: str = _choice(
+        "unused",
+        "What Imu.orientation is good for at start, where nothing better tells the heading: true_north, its yaw is 0 "
+        "in the east (REP-103); magnetic_north, its yaw counts from magnetic east (REP-145), and the declination is "
+        "added as for mag.",
+        "true_north",
+        "magnetic_north",
+    )
+    imu_orientation_std_deg: float = _parameter(
+        10.0,
+        "deg",
+        "Standard deviation of this heading at least.",
+        above=0.0,
+        maximum=90.0,
     )
     use_course: bool = _parameter(
         True,
@@ -656,6 +995,13 @@ class Parameters:
         minimum=(-90.0, -180.0, -1.0e4),
         maximum=(90.0, 180.0, 1.0e6),
     )
+    mode: str = _choice(
+        "loose",
+        "How GNSS is used. loose: the receiver's position and velocity (topics.gnss_fix, topics.gnss_velocity). tight: "
+        "each satellite's pseudorange and Doppler (topics.ranges) in place of the first receiver's fixes; below four "
+        "satellites the estimate then degrades gradually.",
+        "tight",
+    )
     imu: Imu = _group(Imu, "Where the IMU sits and how good it is; biases and noise are in the axes of the IMU.")
     gnss: Gnss = _group(Gnss, "The GNSS receiver: where its antenna sits and how far its messages are trusted.")
     second_gnss: SecondGnss = _group(
@@ -666,8 +1012,10 @@ class Parameters:
     wheel: Wheel = _group(Wheel, "Wheel odometry.")
     body_velocity: BodyVelocity = _group(BodyVelocity, "Velocity in the axes of the vehicle.")
     baro: Baro = _group(Baro, "Barometer.")
+    ranges: Ranges = _group(Ranges, "What a GNSS receiver measures of each satellite: pseudorange and Doppler.")
     zupt: Zupt = _group(Zupt, "Standing still.")
     nhc: Nhc = _group(Nhc, "Non-holonomic constraint.")
+    estimate: Estimate = _group(Estimate, "What is estimated besides the motion and the biases of the IMU.")
     history: History = _group(History, "Late and out-of-order messages.")
     alignment: Alignment = _group(Alignment, "Start-up: levelling, heading, and when the estimate is called good.")
     warm_start: WarmStart = _group(WarmStart, "What the node remembers of its last run.")

@@ -197,7 +197,7 @@ class FrozenGain:
         ):
             aid = layout.allocate(layout.AID)[0]
             aid["stream"] = stream
-            aid["payload"] = np.concatenate([values, covariance[six]])
+            aid["payload"][:9] = np.concatenate([values, covariance[six]])
             navigator.linearize(self.state, aid, self.settings, self.work)
             body_to_map = np.array(to_matrix(tuple(self.state["attitude"])))
             if stream not in self.gains:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from eskf_ros.bags.clouds import POINT_CLOUD, cloud_messages
 from eskf_ros.bags.errors import BagError
 from eskf_ros.bags.messages import MESSAGE_TYPES, StringTable, decode, encode, message_dtype
 from eskf_ros.bags.records import Batch, TopicInfo
@@ -19,12 +20,14 @@ if TYPE_CHECKING:
 
 __all__ = [
     "MESSAGE_TYPES",
+    "POINT_CLOUD",
     "BagError",
     "BagReader",
     "BagWriter",
     "Batch",
     "StringTable",
     "TopicInfo",
+    "cloud_messages",
     "decode",
     "encode",
     "message_dtype",

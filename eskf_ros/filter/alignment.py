@@ -68,6 +68,9 @@ Fixes are differenced, and over fractions of a second: at three sigma the noise 
 REST_TOLERANCE = 0.2
 """Change of the mean specific force across the vertical (m/s2) that a robot at rest may show: settling springs."""
 
+REST_RATE_SIGMAS = 4.0
+"""The mean rate at rest is the bias within this many sigma."""
+
 STRONGEST_START = 5.0
 """No robot gathers speed faster (m/s2)."""
 
@@ -176,6 +179,7 @@ def restart(state):
     """Start the alignment again; only the datum stays."""
     state.restarts += 1
     forget_search(state)
+    state.hint_count = 0
     state.rejected_fixes = 0
     state.level_known = 0
     state.position_known = 0
@@ -184,6 +188,8 @@ def restart(state):
     state.window_start = NEVER
     state.still_stamp = NEVER
     state.still_count = 0
+    for i in range(2):
+        state.clock_known[i] = 0
     for i in range(3):
         state.jump_position[i] -= state.position_map[i]
         state.position_map[i] = 0.0
@@ -217,7 +223,7 @@ def watch_stillness(state, settings):
     duration = (state.stamp - state.window_start) * 1e-9
     if duration < settings.static_duration or state.window_count < MINIMUM_WINDOW_SAMPLES:
         return
-    still = is_still(state, settings) and state.motion_stamp < state.window_start and is_same_rest(state)
+    still = is_still(state, settings) and state.motion_stamp < state.window_start and is_same_rest(state, settings)
     watch_input(state, still, settings)
     if state.position_known == 1 and state.last_fix_stamp < state.window_start:
         # Without a fix since it began nobody knows whether a slow acceleration passes for a tilt.
@@ -242,18 +248,24 @@ def watch_stillness(state, settings):
 
 @njit
 def note_position(state, aid, settings):
-    """Remember a fix, and look at the displacement since the one before the current stillness window."""
+    """Remember a fix, and what it says about motion."""
     fix = geodetic_to_ecef(aid.payload[0], aid.payload[1], aid.payload[2])
-    if NEVER < state.anchor_stamp < aid.stamp:
+    std = math.sqrt(max(aid.payload[3], aid.payload[6], aid.payload[8]))
+    note_place(state, fix, std, aid.stamp, settings)
+
+
+@njit
+def note_place(state, ecef, std, stamp, settings):
+    """Remember a place (m), and look at the displacement since the one before the current stillness window."""
+    if NEVER < state.anchor_stamp < stamp:
         a = state.anchor_ecef
-        step = (fix[0] - a[0], fix[1] - a[1], fix[2] - a[2])
-        std = math.sqrt(2.0 * max(aid.payload[3], aid.payload[6], aid.payload[8]))
-        seconds = (aid.stamp - state.anchor_stamp) * 1e-9
-        speed = (math.sqrt(dot(step, step)) - POSITION_SIGMAS * std) / seconds
-        note_speed(state, speed, state.anchor_stamp, aid.stamp, settings)
-    state.last_fix_stamp = aid.stamp
+        step = (ecef[0] - a[0], ecef[1] - a[1], ecef[2] - a[2])
+        seconds = (stamp - state.anchor_stamp) * 1e-9
+        speed = (math.sqrt(dot(step, step)) - POSITION_SIGMAS * math.sqrt(2.0) * std) / seconds
+        note_speed(state, speed, state.anchor_stamp, stamp, settings)
+    state.last_fix_stamp = stamp
     for i in range(3):
-        state.last_fix_ecef[i] = fix[i]
+        state.last_fix_ecef[i] = ecef[i]
 
 
 @njit
@@ -311,14 +323,23 @@ def is_still(state, settings):
 
 
 @njit
-def is_same_rest(state):
-    """Say whether gravity is still where the last still window left it, as far as the gyros tell.
+def is_same_rest(state, settings):
+    """Say whether rate and gravity are still where the last still window left them.
 
-    A steady acceleration looks like a tilt, but one that no gyro has seen.
+    A creeping turn is as quiet as rest, but its rate is none that the bias can have come to since. A steady
+    acceleration looks like a tilt, but one that no gyro has seen.
     """
     if state.level_known == 0 or state.still_stamp == NEVER:
         return True
     n = state.window_count
+    earth = rotate_back(to_matrix(state.attitude), state.earth_rate_map)
+    noise = settings.gyro_noise_density**2 / ((state.stamp - state.window_start) * 1e-9)
+    walked = settings.gyro_bias_random_walk**2 * (state.stamp - state.still_stamp) * 1e-9
+    for i in range(3):
+        excess = state.window_sum[3 + i] / n - state.gyro_bias[i] - earth[i]
+        variance = state.covariance[GYRO_BIAS + i, GYRO_BIAS + i] + noise + walked
+        if excess * excess > REST_RATE_SIGMAS**2 * variance:
+            return False
     force = (state.window_sum[0] / n, state.window_sum[1] / n, state.window_sum[2] / n)
     force_map = rotate(to_matrix(state.attitude), force)
     sideways = cross(local_up(state), force_map)
@@ -546,6 +567,15 @@ def search_heading(state, aid, gate, settings, work):
     else:
         return
     set_east_north_up_covariance(work.noise, state, local_to_ecef, aid.payload, 3)
+    search_with(state, first, measured, lever, gate, settings, work)
+
+
+@njit
+def search_with(state, first, measured, lever, gate, settings, work):
+    """Search with a position (``first`` 0, m) or velocity (2, m/s) of the antenna, covariance in ``work.noise``.
+
+    ``measured`` in map, ``lever`` (or its velocity) in the axes of the unknown heading.
+    """
     if state.search_started == 1:
         update_search(state, first, measured, lever, work.noise, gate, work)
     elif first == 0:

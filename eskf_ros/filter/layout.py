@@ -14,6 +14,7 @@ from enum import IntEnum
 import numpy as np
 
 from eskf_ros.compiled import COMPILED
+from eskf_ros.gnss.signals import BEIDOU_3, Gnss
 
 # Error state: first index of each block of three. These 15 are the core; every robot has them.
 POSITION = 0
@@ -23,8 +24,25 @@ ACCEL_BIAS = 9
 GYRO_BIAS = 12
 ERROR_SIZE = 15
 
-OPTIONAL_SIZES = {"position_error": 3}
-"""Optional errors behind the core, and how many each is: see ``optional``."""
+OPTIONAL_SIZES = {
+    "position_error": 3,
+    "mounting": 2,
+    "wheel_scale": 1,
+    "clock": 2,
+    "inter_system": 6,
+    "baro_offset": 1,
+    "baro_scale": 1,
+    "mag_error": 1,
+    "magnetic_bias": 3,
+}
+"""Optional errors behind the core, and how many each is: see ``optional``.
+
+``clock``: of the receiver, bias (m) and drift (m/s). ``inter_system``: by what the ranges of a constellation are longer
+than those of GPS (m), in the order of `INTER_SYSTEM`.
+"""
+
+INTER_SYSTEM = (Gnss.GALILEO, BEIDOU_3, Gnss.GLONASS, Gnss.QZSS, Gnss.BEIDOU, Gnss.SBAS)
+"""The constellations but GPS (`gnss.signals.time_group`), the most usual first: a state joins with those before it."""
 
 OPTIONAL_CAPACITY = sum(OPTIONAL_SIZES.values())
 ERROR_CAPACITY = ERROR_SIZE + OPTIONAL_CAPACITY
@@ -80,6 +98,7 @@ class Verdict(IntEnum):
     DISABLED = 11
     WEIGHED_DOWN = 12
     INACTIVE = 13
+    LOW_ELEVATION = 14
 
 
 class Stream(IntEnum):
@@ -107,8 +126,12 @@ STREAM_NAMES = tuple(stream.name.lower() for stream in Stream)
 
 CONSTRAINTS = (Stream.ZUPT, Stream.ZARU, Stream.NHC)
 
-CONSTRAINT_INTERVAL = 100_000_000
-"""The grid of the constraints (ns)."""
+CONSTRAINT_INTERVAL = 1_000_000_000
+"""The grid of the constraints (ns).
+
+What makes them wrong (side slip, a body that sways) lasts for about half as long at the least: closer together they
+would not be independent of each other, and the filter would believe their mean too much.
+"""
 
 STATE = np.dtype(
     [
@@ -162,6 +185,14 @@ STATE = np.dtype(
         ("search_tilt_variance", "f8"),
         ("search_age", "f8"),
         ("search_turn", "f8"),
+        # What a sensor says of the unknown heading: its rank, how often it agreed with itself since when, the last
+        # message, by how much (rad) it would turn the attitude, and its standard deviation.
+        ("hint_rank", "i8"),
+        ("hint_count", "i8"),
+        ("hint_since", "i8"),
+        ("hint_stamp", "i8"),
+        ("hint_turn", "f8"),
+        ("hint_std", "f8"),
         # External evidence of motion: when GNSS last proved it, the last fix, and the one the window started from.
         ("motion_stamp", "i8"),
         ("last_fix_stamp", "i8"),
@@ -177,6 +208,16 @@ STATE = np.dtype(
         ("still_stamp", "i8"),
         ("still_count", "i8"),
         ("still_sum", "f8", (6,)),
+        # IMU samples since the last point on the grid of the constraints: the point after them, whether one is missing,
+        # how many, sums.
+        ("block_end", "i8"),
+        ("block_broken", "i8"),
+        ("block_count", "i8"),
+        ("block_sum", "f8", (6,)),
+        ("block_square_sum", "f8", (6,)),
+        # Wheels: when they spoke last, and when the gate last refused to believe them.
+        ("wheel_stamp", "i8"),
+        ("slip_stamp", "i8"),
         # Monitors: windows seen, those at rest, and those in which the IMU cannot be what it should be.
         ("windows", "i8"),
         ("rest_windows", "i8"),
@@ -185,11 +226,35 @@ STATE = np.dtype(
         ("tilted_windows", "i8"),
         ("tilted_force", "f8", (3,)),
         ("fast_windows", "i8"),
+        # Monitors of the heading: sums of cosine and sine, and how many. Messages of the dual antenna and of the
+        # magnetometer against the estimate; course over ground against the estimate.
+        ("heading_contrast", "f8", (2, 3)),
+        ("course_contrast", "f8", (3,)),
+        # Strength (T) and inclination (rad) of the field last measured, how many were disturbed, and how many were.
+        ("field_found", "f8", (2,)),
+        ("disturbed_fields", "f8"),
+        ("fields", "f8"),
         # When absolute aids were last accepted, how many were rejected since, and how often that ended in a restart.
         ("absolute_stamp", "i8"),
         ("absolute_interval", "i8"),
         ("rejected_fixes", "i8"),
         ("restarts", "i8"),
+        # The Earth's magnetic field where the last good fix was (rad, rad, T; strength 0: unknown), whether it is
+        # known, when it was last found disturbed; heading and place since which its error is another.
+        ("field_declination", "f8"),
+        ("field_inclination", "f8"),
+        ("field_strength", "f8"),
+        ("field_known", "i8"),
+        ("disturbed_stamp", "i8"),
+        ("mag_heading", "f8"),
+        ("mag_position", "f8", (3,)),
+        # When a pressure was last accepted.
+        ("baro_stamp", "i8"),
+        # Tight coupling: whether the errors of clock bias and drift have values yet, milliseconds it has jumped by,
+        # and how often most of the satellites contradicted the state.
+        ("clock_known", "i8", (2,)),
+        ("clock_jumps", "i8"),
+        ("range_faults", "i8"),
     ],
     align=True,
 )
@@ -197,7 +262,7 @@ STATE = np.dtype(
 
 IMU = np.dtype([("stamp", "i8"), ("specific_force", "f8", (3,)), ("angular_rate", "f8", (3,))], align=True)
 
-PAYLOAD_SIZE = 16
+PAYLOAD_SIZE = 21
 AID = np.dtype(
     [
         ("stamp", "i8"),
@@ -279,7 +344,27 @@ SETTINGS = np.dtype(
         ("imu_to_base", "f8", (3, 3)),
         ("imu_position_base", "f8", (3,)),
         ("lever_arms_body", "f8", (SOURCES, 3)),
+        ("heading_lines_body", "f8", (SOURCES, 3)),
+        ("baro_arm_body", "f8", (3,)),
+        ("mag_to_imu", "f8", (3, 3)),
+        ("mag_strength_tolerance", "f8"),
+        ("mag_inclination_tolerance", "f8"),
+        ("mag_error_distance", "f8"),
+        ("is_orientation_magnetic", "i8"),
         ("correlated_share", "f8"),
+        ("wheel_arm_body", "f8", (3,)),
+        ("wheel_slip", "f8"),
+        ("nhc_arm_body", "f8", (3,)),
+        ("nhc_lateral_std", "f8"),
+        ("nhc_vertical_std", "f8"),
+        ("nhc_angle_std", "f8"),
+        ("nhc_slip", "f8"),
+        # Ranges: lowest elevation (rad), factor on variances, floors (m, m/s), what lasts in their errors (m).
+        ("elevation_mask", "f8"),
+        ("range_covariance_scale", "f8"),
+        ("code_std_floor", "f8"),
+        ("range_rate_std_floor", "f8"),
+        ("range_error_std", "f8"),
         ("gate", "f8", (len(Stream), 4)),
         ("reach", "i8", (len(Stream),)),
         ("constrains", "i8", (len(Stream),)),
@@ -334,6 +419,9 @@ LOCAL = np.dtype(
 )
 """Pose of the IMU in `odom` (m, rad) and the variances it has gathered since the start (per axis)."""
 
+LARGEST_EPOCH = 256
+"""So many signals of an epoch are looked at together."""
+
 WORK = np.dtype(
     [
         ("half", "f8", (ACCEL_BIAS, ERROR_SIZE)),
@@ -346,6 +434,20 @@ WORK = np.dtype(
         ("gain", "f8", (ERROR_CAPACITY, 3)),
         ("residual_gain", "f8", (ERROR_CAPACITY, 3)),
         ("correction", "f8", (ERROR_CAPACITY,)),
+        # The signals of one epoch, and their least squares (see ``ranges``).
+        ("signal_count", "i8"),
+        ("signal_index", "i8", (LARGEST_EPOCH,)),
+        ("signal_innovation", "f8", (LARGEST_EPOCH,)),
+        ("signal_spread", "f8", (LARGEST_EPOCH,)),
+        ("signal_noise", "f8", (LARGEST_EPOCH,)),
+        ("signal_direction", "f8", (LARGEST_EPOCH, 3)),
+        ("signal_weight", "f8", (LARGEST_EPOCH,)),
+        ("signal_residual", "f8", (LARGEST_EPOCH,)),
+        ("signal_square", "f8", (LARGEST_EPOCH,)),
+        ("sorted", "f8", (LARGEST_EPOCH,)),
+        ("normal", "f8", (4, 4)),
+        ("right", "f8", (4,)),
+        ("step", "f8", (4,)),
     ],
     align=True,
 )
@@ -388,13 +490,14 @@ def allocate(dtype: np.dtype, count: int = 1) -> np.ndarray:
     return memory if COMPILED else memory.view(np.recarray)
 
 
-_EVIDENCE = ("still_stamp", "motion_stamp", "last_fix_stamp", "anchor_stamp")
+_EVIDENCE = ("still_stamp", "motion_stamp", "last_fix_stamp", "anchor_stamp", "block_end", "wheel_stamp", "slip_stamp")
 
 
 def blank_state() -> np.ndarray:
     """Return the state before the first IMU sample."""
     state = allocate(STATE)
-    for field in ("stamp", "imu_stamp", "first_stamp", "window_start", "absolute_stamp", *_EVIDENCE):
+    stamps = ("stamp", "imu_stamp", "first_stamp", "window_start", "absolute_stamp", "baro_stamp", "disturbed_stamp")
+    for field in (*stamps, *_EVIDENCE):
         state[field] = NEVER
     state["attitude"][0, 0] = 1.0
     state["error_size"] = ERROR_SIZE

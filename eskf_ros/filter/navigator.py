@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
-from eskf_ros.filter.aiding import gnss_position, gnss_velocity
+from eskf_ros.filter.aiding import baro, gnss_position, gnss_velocity, heading, mag, nhc, wheel
 from eskf_ros.filter.alignment import (
     heading_of,
     move_datum,
@@ -25,7 +25,8 @@ from eskf_ros.filter.alignment import (
     start_position,
     watch_stillness,
 )
-from eskf_ros.filter.door import admit
+from eskf_ros.filter.door import ABSENT, admit
+from eskf_ros.filter.heading_hints import is_heading_told
 from eskf_ros.filter.layout import (
     AID,
     CONSTRAINTS,
@@ -44,11 +45,19 @@ from eskf_ros.filter.layout import (
     blank_state,
 )
 from eskf_ros.filter.local import carry, measure_step, note_jump
-from eskf_ros.filter.monitors import complaints
+from eskf_ros.filter.monitors import complaints, watch_course, watch_field, watch_heading
 from eskf_ros.filter.optional import join
 from eskf_ros.filter.output import status_of, write_odometry
-from eskf_ros.filter.recovery import is_near_gate, judge_filter, update_weighed_down, watch_solution
+from eskf_ros.filter.ranges import end_of_epoch, fuse_ranges, is_range, offer_signals
+from eskf_ros.filter.recovery import (
+    is_near_gate,
+    judge_filter,
+    judge_pressure,
+    update_weighed_down,
+    watch_solution,
+)
 from eskf_ros.filter.settings import intakes_from, settings_from
+from eskf_ros.filter.stillness import add_to_block, watch_wheels
 from eskf_ros.filter.strapdown import SECOND, propagate
 from eskf_ros.filter.timeline import (
     CHECKPOINT_SPACING,
@@ -56,7 +65,7 @@ from eskf_ros.filter.timeline import (
     forget,
     insert_aid,
     insert_imu,
-    is_duplicate,
+    open_record,
     raise_barrier,
     rewind,
     save_checkpoint,
@@ -64,6 +73,13 @@ from eskf_ros.filter.timeline import (
 )
 from eskf_ros.filter.update import update
 from eskf_ros.filter.warm_start import Memory, recall
+from eskf_ros.filter.wheel_heading import search_with_wheels
+from eskf_ros.gnss.measurements import MEASURED_SIGNAL
+from eskf_ros.gnss.range_model import NO_KLOBUCHAR
+from eskf_ros.gnss.ranges import Status as RangeStatus
+from eskf_ros.gnss.ranges import status_counts
+from eskf_ros.gnss.time import SECONDS_PER_WEEK, Instant
+from eskf_ros.magnetic_model import FieldUnknown, field_at
 from eskf_ros.parameters import Parameters
 from eskf_ros.rotation import to_matrix
 
@@ -72,10 +88,15 @@ StampArray = npt.NDArray[np.int64]
 
 GNSS_POSITION = int(Stream.GNSS_POSITION)
 GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
+WHEEL = int(Stream.WHEEL)
+NHC = int(Stream.NHC)
+HEADING = int(Stream.HEADING)
+MAG = int(Stream.MAG)
+BARO = int(Stream.BARO)
 OPEN_DOOR = int(Verdict.WAITING)
 FIRST_CONSTRAINT = int(min(CONSTRAINTS))
 FUSED = int(Verdict.FUSED)
-DUPLICATE = int(Verdict.DUPLICATE)
+GATE = int(Verdict.GATE)
 BEFORE_ALIGNMENT = int(Verdict.BEFORE_ALIGNMENT)
 INACTIVE = int(Verdict.INACTIVE)
 
@@ -86,6 +107,11 @@ IMU_BATCH = 1024
 
 HIGHEST_ALTITUDE = 1e5
 """What no receiver on a robot reports (m)."""
+
+ORIENTATION_SHARE = SECOND // 20
+"""Of each second so much (ns) of what the IMU says of its orientation is used."""
+
+DIAGONAL = np.eye(3).ravel()
 
 NO_STAND_IN = (0.0, 0.0, 0.0)
 """The covariance of a message is its own."""
@@ -106,14 +132,14 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
 
         while state.aid_next < t.aid_count and aids[state.aid_next].stamp < sample.stamp:
             predict(state, aids[state.aid_next].stamp, sample, settings, work)
-            fuse(state, aids, state.aid_next, settings, work)
-            state.aid_next += 1
+            state.aid_next = fuse_next(state, aids, t.aid_count, settings, work)
 
         previous_stamp = state.imu_stamp
         predict(state, sample.stamp, sample, settings, work)
         take_sample(state, sample)
         measure_step(state, settings)
         watch_stillness(state, settings)
+        add_to_block(state, settings)
         save_checkpoint(states, checkpoints, t)
 
         is_new = sample.stamp > t.published and state.level_known == 1
@@ -121,8 +147,7 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
             carry(local, state, settings)
 
         while state.aid_next < t.aid_count and aids[state.aid_next].stamp == sample.stamp:
-            fuse(state, aids, state.aid_next, settings, work)
-            state.aid_next += 1
+            state.aid_next = fuse_next(state, aids, t.aid_count, settings, work)
 
         if is_new and is_on_grid(previous_stamp, sample.stamp, settings.output_interval):
             write_odometry(state, local, settings, rows[row_count])
@@ -160,38 +185,63 @@ def take_sample(state, sample):
 
 
 @njit
+def fuse_next(state, aids, count, settings, work):
+    """Offer the next of ``count`` measurements, signals by the epoch; return the index of the one that follows."""
+    i = state.aid_next
+    if not is_range(aids[i].stream):
+        fuse(state, aids, i, settings, work)
+        return i + 1
+    end = end_of_epoch(aids, i, count)
+    fuse_ranges(state, aids, i, end, settings, work)
+    return end
+
+
+@njit
 def fuse(state, aids, i, settings, work):
     """Offer one measurement to the state and leave the verdict in its record."""
+    if not open_record(aids, i):
+        return
     aid = aids[i]
-    aid.verdict = aid.door
-    aid.nis = np.nan
-    aid.dof = 0
-    for k in range(3):
-        aid.innovation[k] = np.nan
-    if aid.door != OPEN_DOOR:
-        return
-    if is_duplicate(aids, i):
-        aid.verdict = DUPLICATE
-        return
     if aid.stream == GNSS_POSITION:
         note_position(state, aid, settings)
     elif aid.stream == GNSS_VELOCITY:
         note_velocity(state, aid, settings)
+        watch_course(state, aid, heading_of(state, settings), settings)
     if not is_aligned_for(state, aid.stream):
+        if aid.stream == WHEEL:
+            search_with_wheels(state, aid.payload, settings.gate[WHEEL, 2], settings, work)
+            watch_wheels(state, aid)
         aid.verdict = BEFORE_ALIGNMENT if aid.stream < FIRST_CONSTRAINT else INACTIVE
         return
+    if aid.stream == HEADING and aid.source == heading.IMU_ORIENTATION and state.heading_known == 1:
+        aid.verdict = INACTIVE
+        return
     position = (state.position_map[0], state.position_map[1], state.position_map[2])
-    heading = heading_of(state, settings)
+    heading_before = heading_of(state, settings)
     if state.position_known == 0 and aid.stream == GNSS_POSITION:
         start_position(state, aid.payload)
         recall_heading(state, aid.payload, settings)
     join(state, settings.reach[aid.stream], settings)
     if aid.stream == GNSS_POSITION:
         watch_solution(state, aid, settings)
+    elif aid.stream == MAG:
+        mag.note_way(state, heading_before, settings)
+        is_disturbed = mag.is_disturbed(state, aid, settings)
+        watch_field(state, is_disturbed)
+        if is_disturbed:
+            aid.verdict = GATE
+            return
     size = linearize(state, aid, settings, work)
     if size == 0:
         aid.verdict = INACTIVE
         return
+    if aid.stream in (HEADING, MAG):
+        watch_heading(state, aid, work)
+        if state.heading_known == 0:
+            if not is_heading_told(state, aid, settings, work):
+                aid.verdict = BEFORE_ALIGNMENT
+                return
+            size = linearize(state, aid, settings, work)
     gate = settings.gate[aid.stream, size]
     for k in range(size):
         aid.innovation[k] = work.innovation[k]
@@ -204,7 +254,12 @@ def fuse(state, aids, i, settings, work):
         search_heading(state, aid, gate, settings, work)
     if aid.stream == GNSS_POSITION:
         judge_filter(state, aid.verdict)
-    note_jump(state, position, heading, settings)
+        mag.note_field(state, aid)
+    elif aid.stream == WHEEL:
+        watch_wheels(state, aid)
+    elif aid.stream == BARO:
+        judge_pressure(state, aid.verdict, settings)
+    note_jump(state, position, heading_before, settings)
 
 
 @njit
@@ -214,8 +269,10 @@ def is_aligned_for(state, stream):
         return False
     if stream == GNSS_POSITION:
         return True
-    if stream == GNSS_VELOCITY:
+    if stream in (GNSS_VELOCITY, HEADING, BARO):
         return state.position_known == 1
+    if stream == MAG:
+        return state.position_known == 1 and state.field_known == 1
     return state.position_known == 1 and state.heading_known == 1
 
 
@@ -227,6 +284,16 @@ def linearize(state, aid, settings, work):
     """
     if aid.stream == GNSS_POSITION:
         return gnss_position.linearize(state, aid.payload, aid.source, settings, work)
+    if aid.stream == WHEEL:
+        return wheel.linearize(state, aid.payload, settings, work)
+    if aid.stream == NHC:
+        return nhc.linearize(state, settings, work)
+    if aid.stream == HEADING:
+        return heading.linearize(state, aid.payload, aid.source, settings, work)
+    if aid.stream == MAG:
+        return mag.linearize(state, aid.payload, settings, work)
+    if aid.stream == BARO:
+        return baro.linearize(state, aid.payload, aid.source, settings, work)
     return gnss_velocity.linearize(state, aid.payload, aid.source, settings, work)
 
 
@@ -261,6 +328,7 @@ class Navigator:
         self.parameters = parameters
         self._settings = settings_from(parameters, self._output_rate)
         self._intakes = intakes_from(parameters)
+        self._needs_field = parameters.mag.use or parameters.alignment.imu_orientation == "magnetic_north"
         if self._memory is not None:
             recall(*self._memory, parameters, self._settings[0])
 
@@ -282,6 +350,9 @@ class Navigator:
         self._refused_count: Counter[Stream] = Counter()
         self._stamp_difference: dict[Stream, float] = {}
         self._stand_ins = 0
+        self.range_statuses: Counter[RangeStatus] = Counter()
+        """What became of the signals before they entered the timeline: how many are usable, and why others are not."""
+        self._field_problem = ""
 
     def warm_start(self, memory: Memory, age: float) -> None:
         """Offer what an earlier run knew, ``age`` seconds ago; to be called before the first sample."""
@@ -410,6 +481,8 @@ class Navigator:
             abs(latitude_deg) > 90.0 or abs(longitude_deg) > 360.0 or abs(altitude) > HIGHEST_ALTITUDE
         ):
             aid["door"] = Verdict.BAD_VALUE
+        elif aid["door"] == Verdict.WAITING and self._needs_field:
+            self._add_field(latitude_deg, longitude_deg, altitude, stamp)
         self._push_gnss(Stream.GNSS_POSITION, stamp, arrival, frame_id)
 
     def push_gnss_velocity(
@@ -443,6 +516,71 @@ class Navigator:
         """
         self._take(stream, values, covariance)
         self._push_aid(stream, stamp + round(self._intakes[stream].time_offset * SECOND), arrival)
+
+    def push_ranges(
+        self,
+        stamp: int,
+        instant: Instant,
+        signals: np.ndarray,
+        klobuchar: FloatArray = NO_KLOBUCHAR,
+        arrival: int = 0,
+    ) -> None:
+        """Take the signals (MEASURED_SIGNAL, `gnss.measurements.measured_epoch`) of one epoch of the first receiver.
+
+        ``stamp``: the instant of the measurement on the IMU's clock; ``instant``: the same in GPS time, to a minute;
+        ``klobuchar``: eight parameters of the ionosphere. The signals have been measured without a position, so that
+        they do not depend on when they come.
+        """
+        self.range_statuses.update(status_counts(signals))
+        is_tight, ranges = self.parameters.mode == "tight", self.parameters.ranges
+        code_door = Verdict.WAITING if is_tight and ranges.use else Verdict.DISABLED
+        rate_door = Verdict.WAITING if is_tight and ranges.use_doppler else Verdict.DISABLED
+        stamp += round(ranges.time_offset * SECOND)
+        self._make_room(2 * len(signals))
+        refused = np.zeros(2 * len(signals), RECORD)
+        count = offer_signals(
+            self._aids,
+            self._timeline,
+            self._offered,
+            signals,
+            stamp,
+            arrival,
+            instant[0] * SECONDS_PER_WEEK + instant[1],
+            klobuchar,
+            int(code_door),
+            int(rate_door),
+            refused,
+        )
+        for stream in (Stream.PSEUDORANGE, Stream.RANGE_RATE):
+            self._offered_count[stream] += 1
+            if (refused["stream"][:count] == stream).any():
+                self._note_refused(stream, stamp)
+        if count:
+            self._refused.append(refused[:count])
+
+    def push_imu_orientation(self, stamps: StampArray, orientation: FloatArray, covariance: FloatArray) -> None:
+        """Take what samples of `push_imu` say of the IMU's orientation: (n, 4) x y z w and (n, 9) rad2, as in REP-145.
+
+        Nothing happens unless ``alignment.imu_orientation`` asks for it; then the first few of each second are enough:
+        which these are must not depend on the order in which they come.
+        """
+        alignment = self.parameters.alignment
+        if alignment.imu_orientation == "unused":
+            return
+        forward_imu = self._settings["imu_to_base"][0, 0]
+        for i in np.flatnonzero(covariance[:, 0] != ABSENT):
+            stamp = int(stamps[i])
+            if stamp % SECOND >= ORIENTATION_SHARE:
+                continue
+            x, y, z, w = (float(value) for value in orientation[i])
+            yaw = math.nan
+            if abs(x * x + y * y + z * z + w * w - 1.0) < 0.1:
+                forward = np.array(to_matrix((w, x, y, z))) @ forward_imu
+                yaw = math.atan2(forward[1], forward[0])
+            std = math.radians(alignment.imu_orientation_std_deg)
+            given = np.diag([covariance[i, 8], ABSENT, ABSENT]).ravel()
+            admit(self._offered, (yaw, 0.0, 0.0), given, NO_STAND_IN, 1.0, (std, std, std), True)
+            self._push_aid(Stream.HEADING, stamp, stamp, heading.IMU_ORIENTATION)
 
     def take_records(self) -> np.ndarray:
         """Return the records (RECORD) that became final since the last call: in the total order, the too late last."""
@@ -536,6 +674,8 @@ class Navigator:
     def complaints(self) -> list[str]:
         """What is wrong with whole streams, one sentence each with what to do; empty when nothing is."""
         found = complaints(self._states[0])
+        if self._field_problem:
+            found.append(self._field_problem)
         if self._stand_ins:
             found.append(
                 f"{self._stand_ins} messages came without a covariance (unknown type or all zero): "
@@ -561,6 +701,8 @@ class Navigator:
         intake = self._intakes[stream]
         matrix = np.ascontiguousarray(covariance, np.float64)
         is_absent = not matrix.any() or (matrix[0] < 0.0 and not intake.may_lack_axes)
+        if intake.largest_variance < math.inf:
+            matrix = np.where((matrix > intake.largest_variance) & (DIAGONAL == 1.0), ABSENT, matrix)
         x, y, z = intake.unknown_std
         stand_in = (x * x, y * y, z * z) if is_absent else NO_STAND_IN
         self._admit(stream, (float(values[0]), float(values[1]), float(values[2])), matrix, stand_in)
@@ -579,17 +721,34 @@ class Navigator:
         aid = self._offered[0]
         if not intake.is_used:
             aid["door"] = Verdict.DISABLED
-        elif aid["door"] == Verdict.WAITING and max(map(abs, values)) > intake.largest:
+        elif aid["door"] == Verdict.WAITING and (max(map(abs, values)) > intake.largest or values[0] < intake.lowest):
             aid["door"] = Verdict.BAD_VALUE
         if aid["door"] == Verdict.WAITING and stand_in is not NO_STAND_IN:
             self._stand_ins += 1
         return aid
+
+    def _add_field(self, latitude_deg: float, longitude_deg: float, altitude: float, stamp: int) -> None:
+        """Write the Earth's magnetic field at a fix, a function of the fix alone, to the record that is on offer."""
+        declination = math.radians(self.parameters.mag.declination_deg)
+        try:
+            found, inclination, strength = field_at(latitude_deg, longitude_deg, altitude, stamp)
+        except FieldUnknown as problem:
+            if math.isnan(declination):
+                self._field_problem = str(problem)
+                return
+            found, inclination, strength = declination, 0.0, 0.0
+        if math.isnan(declination):
+            declination = found
+        self._offered[0]["payload"][mag.FIELD :] = (1.0, declination, inclination, strength)
 
     def _push_gnss(self, stream: Stream, stamp: int, arrival: int, frame_id: str) -> None:
         """Sort the record that is on offer into the timeline, as one of the receiver with this frame."""
         second = self.parameters.second_gnss
         is_second = second.frame_id != "" and frame_id == second.frame_id
         offset = second.time_offset if is_second else self.parameters.gnss.time_offset
+        if self.parameters.mode == "tight" and not is_second:
+            # The fix is made of the same ranges: both together would count twice.
+            self._offered[0]["door"] = Verdict.DISABLED
         self._push_aid(stream, stamp + round(offset * SECOND), arrival, int(is_second))
 
     def _push_aid(self, stream: Stream, stamp: int, arrival: int, source: int = 0) -> None:
@@ -598,6 +757,8 @@ class Navigator:
         aid = self._offered[0]
         aid["source"] = source
         aid["stamp"], aid["arrival"], aid["stream"], aid["verdict"] = stamp, arrival, stream, aid["door"]
+        # So it stays in the record of a measurement that waits in vain.
+        aid["dof"], aid["nis"], aid["innovation"] = 0, math.nan, math.nan
         self._make_room()
         refused = insert_aid(self._aids, self._timeline, self._offered)
         if refused:
@@ -605,12 +766,15 @@ class Navigator:
 
     def _refuse(self, stream: Stream, stamp: int, arrival: int, source: int, verdict: Verdict) -> None:
         """Record a measurement that never enters the timeline."""
+        self._note_refused(stream, stamp)
+        record = (stamp, arrival, stream, source, verdict, 0, math.nan, (math.nan,) * 3)
+        self._refused.append(np.array([record], RECORD))
+
+    def _note_refused(self, stream: Stream, stamp: int) -> None:
         frontier = int(self._timeline["frontier"][0])
         if frontier != NEVER:
             self._refused_count[stream] += 1
             self._stamp_difference[stream] = (stamp - frontier) / SECOND
-        record = (stamp, arrival, stream, source, verdict, 0, math.nan, (math.nan,) * 3)
-        self._refused.append(np.array([record], RECORD))
 
     def _take_records(self, everything: bool) -> np.ndarray:
         records = allocate(RECORD, max(1, int(self._timeline["aid_count"][0] - self._timeline["recorded"][0])))
@@ -623,12 +787,12 @@ class Navigator:
         self.update()
         forget(self._states, self._imu, self._aids, self._checkpoints, self._timeline)
 
-    def _make_room(self) -> None:
-        """See that one batch of IMU samples with its checkpoints, and one aid, fit into the buffers."""
+    def _make_room(self, aids: int = 1) -> None:
+        """See that one batch of IMU samples with its checkpoints, and so many aids, fit into the buffers."""
         timeline = self._timeline
         checkpoints_needed = IMU_BATCH // CHECKPOINT_SPACING + 2
         # An interval between two samples has room for one grid point of the constraints.
-        aids_needed = 2 + IMU_BATCH * int(self._settings["constrains"].sum())
+        aids_needed = 1 + aids + IMU_BATCH * int(self._settings["constrains"].sum())
         if (
             len(self._imu) >= timeline["imu_count"][0] + IMU_BATCH
             and len(self._aids) >= timeline["aid_count"][0] + aids_needed
@@ -652,6 +816,7 @@ def compile_kernels() -> None:
     trial.push_imu(np.array([stamp]), np.array([[0.0, 0.0, 9.8]]), np.zeros((1, 3)))
     trial.push_gnss_position(stamp, *point, unit, 2, 0)
     trial.push_gnss_velocity(stamp, point, unit)
+    trial.push_ranges(stamp, (0, 0.0), np.zeros(1, MEASURED_SIGNAL))
     trial.take_records()
     trial.odometry  # noqa: B018 - asked for its side effect
     trial.status  # noqa: B018

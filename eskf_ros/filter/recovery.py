@@ -38,9 +38,22 @@ def watch_solution(state, aid, settings):
     """Begin again with the lasting error of the fixes when the receiver changes its kind of solution."""
     variance = aid.payload[3] + aid.payload[6]
     last = state.last_fix_variance[aid.source]
-    if settings.position_error_at < state.error_size and max(variance, last) > SAME_SOLUTION * min(variance, last):
+    lasts = settings.position_error_at < state.error_size and settings.correlated_share > 0.0
+    if lasts and max(variance, last) > SAME_SOLUTION * min(variance, last):
         renew(state, settings.position_error_at, 3, settings)
     state.last_fix_variance[aid.source] = variance
+
+
+@njit
+def judge_pressure(state, verdict, settings):
+    """Begin again with the offset of the barometer when what it says was outside the gate for long.
+
+    A door or a fan has changed the pressure for good: it says nothing of the height, but soon again of its changes.
+    """
+    if verdict == GATE and state.stamp - state.baro_stamp > REJECTED_TIME:
+        renew(state, settings.baro_offset_at, 1, settings)
+    if verdict == FUSED:
+        state.baro_stamp = state.stamp
 
 
 @njit

@@ -12,6 +12,7 @@ from eskf_ros.bags import Batch
 from eskf_ros.filter.layout import ODOMETRY, Status
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.inputs import Input
+from eskf_ros.ranges.intake import RangeIntake
 from eskf_ros.replay.topics import TopicNames
 
 LARGEST_PUSH = 1024
@@ -42,6 +43,7 @@ class Feed:
         order: str = "log",
         outages: tuple[tuple[float, float], ...] = (),
         ins_only: bool = False,
+        intake: RangeIntake | None = None,
     ) -> None:
         self._navigator = navigator
         self._topics = topics
@@ -52,7 +54,7 @@ class Feed:
         self.first_stamp: int | None = None
         self.imu_count = 0
         self.withheld = {kind.stream: 0 for kind in topics.inputs}
-        self._pushes = {kind.stream: kind.push_of(navigator) for kind in topics.inputs}
+        self._pushes = {kind.name: kind.push_of(navigator, intake) for kind in topics.inputs}
 
     def ordered(self, batches: Iterable[dict[str, Batch]]) -> Iterable[dict[str, Batch]]:
         """The batches as they have to be pushed."""
@@ -75,6 +77,8 @@ class Feed:
             nonlocal done
             while imu is not None and done < end:
                 part = slice(done, min(end, done + LARGEST_PUSH))
+                orientation = imu.messages["orientation"][part], imu.messages["orientation_covariance"][part]
+                self._navigator.push_imu_orientation(stamps[part], *orientation)
                 rows.append(self._navigator.push_imu(stamps[part], specific_force[part], angular_rate[part]))
                 done = part.stop
 
@@ -84,7 +88,7 @@ class Feed:
             if kind.is_gnss and (self._gnss_over or self._in_outage(arguments[0])):
                 self.withheld[kind.stream] += 1
             else:
-                self._pushes[kind.stream](*arguments)
+                self._pushes[kind.name](*arguments)
         if imu is not None:
             push_imu_until(len(stamps))
         # As bytes: numpy copies structured arrays field by field and takes ten times as long.

@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.bags import message_dtype
+from eskf_ros.bags import cloud_messages, message_dtype
+from eskf_ros.gnss.cloud import write_epoch
+from eskf_ros.gnss.ephemeris_cloud import write_ephemerides
 from eskf_ros.simulate.barometer import BarometerMeasurements
 from eskf_ros.simulate.body_velocity import BodyVelocityMeasurements
 from eskf_ros.simulate.dual_antenna import DualAntennaMeasurements
 from eskf_ros.simulate.frames import Frame
 from eskf_ros.simulate.magnetometer import MagnetometerMeasurements
+from eskf_ros.simulate.range_receiver import RangeMeasurements
 from eskf_ros.simulate.wheel import WheelMeasurements
 
 ABSENT = -1.0
@@ -50,13 +53,17 @@ def barometer(measured: BarometerMeasurements, part: slice) -> NDArray[Any]:
 
 
 def dual_antenna(measured: DualAntennaMeasurements, part: slice) -> NDArray[Any]:
-    """Return sensor_msgs/Imu with the yaw of the baseline; roll and pitch are zero and may be anything."""
+    """Return sensor_msgs/Imu with yaw and pitch of the baseline; what is not measured is zero and may be anything."""
     messages = _stamped("sensor_msgs/msg/Imu", measured.stamp[part], Frame.GNSS)
-    messages["orientation"][:, 2] = np.sin(0.5 * measured.yaw[part])
-    messages["orientation"][:, 3] = np.cos(0.5 * measured.yaw[part])
+    yaw, pitch = 0.5 * measured.yaw[part], 0.5 * measured.pitch[part]
+    messages["orientation"][:, 0] = -np.sin(yaw) * np.sin(pitch)
+    messages["orientation"][:, 1] = np.cos(yaw) * np.sin(pitch)
+    messages["orientation"][:, 2] = np.sin(yaw) * np.cos(pitch)
+    messages["orientation"][:, 3] = np.cos(yaw) * np.cos(pitch)
     # A first element of -1 would say that there is no orientation at all (REP-145).
-    yaw_variance = math.radians(measured.sensor.yaw_std_deg) ** 2
-    messages["orientation_covariance"] = np.diag([math.pi**2, math.pi**2, yaw_variance]).ravel()
+    stds = (math.inf, measured.sensor.pitch_std_deg, measured.sensor.yaw_std_deg)
+    variances = [min(math.radians(std), math.pi) ** 2 for std in stds]
+    messages["orientation_covariance"] = np.diag(variances).ravel()
     messages["angular_velocity_covariance"][:, 0] = ABSENT
     messages["linear_acceleration_covariance"][:, 0] = ABSENT
     return messages
@@ -68,6 +75,22 @@ def body_velocity(measured: BodyVelocityMeasurements, part: slice) -> NDArray[An
     messages["linear_velocity"] = measured.velocity[part]
     messages["twist_covariance"] = np.diag([*measured.variance, ABSENT, ABSENT, ABSENT]).ravel()
     return messages
+
+
+def ranges(measured: RangeMeasurements, part: slice) -> NDArray[Any]:
+    """Return `gnss/ranges` (sensor_msgs/PointCloud2), with satellite states if the receiver gives them."""
+    clouds = [
+        write_epoch(measured.epoch(k), int(measured.week[k]), float(measured.seconds[k]), measured.sensor.satellites)
+        for k in range(len(measured.stamp))[part]
+    ]
+    return cloud_messages(measured.stamp[part], clouds, Frame.GNSS)
+
+
+def ephemerides(measured: RangeMeasurements, part: slice) -> NDArray[Any]:
+    """Return `gnss/ephemerides` (sensor_msgs/PointCloud2): all there are, once."""
+    stamps = measured.ephemerides_stamp[part]
+    cloud = write_ephemerides(measured.broadcasts, measured.klobuchar)
+    return cloud_messages(stamps, [cloud] * len(stamps), Frame.GNSS)
 
 
 def _stamped(type_name: str, stamp: NDArray[np.int64], frame: Frame) -> NDArray[Any]:
