@@ -739,7 +739,7 @@ class Navigator:
             found, inclination, strength = declination, 0.0, 0.0
         if math.isnan(declination):
             declination = found
-        self._offered[0]["payload"][mag.FIELD :] = (1.0, declination, inclination, strength)
+        self._offered[0]["payload"][mag.FIELD : mag.FIELD + 4] = (1.0, declination, inclination, strength)
 
     def _push_gnss(self, stream: Stream, stamp: int, arrival: int, frame_id: str) -> None:
         """Sort the record that is on offer into the timeline, as one of the receiver with this frame."""
