@@ -15,21 +15,25 @@ Pose = tuple[np.ndarray, np.ndarray]
 """Position (3,) m and rotation matrix (3, 3) of a frame in another."""
 
 IMU, ANTENNA, SECOND_ANTENNA = "IMU", "GNSS antenna", "second GNSS antenna"
+MAGNETOMETER, BAROMETER = "magnetometer", "barometer"
 
 
 @dataclass(frozen=True)
 class Place:
     """Where a sensor sits: parameters of its position and orientation (empty: of no account), inputs that name it."""
 
-    position: str
+    position: str = ""
     rotation: str = ""
     inputs: tuple[str, ...] = ()
 
 
 PLACES = {
     IMU: Place("imu.mount_position", "imu.mount_rpy_deg"),
-    ANTENNA: Place("gnss.lever_arm", inputs=("gnss_fix", "gnss_velocity")),
+    # Not by the velocities: many drivers name the axes they are given in.
+    ANTENNA: Place("gnss.lever_arm", inputs=("gnss_fix", "ranges")),
     SECOND_ANTENNA: Place("second_gnss.lever_arm"),
+    MAGNETOMETER: Place(rotation="mag.mount_rpy_deg", inputs=("mag",)),
+    BAROMETER: Place("baro.position", inputs=("baro",)),
 }
 """One row for each sensor whose place in base_link counts."""
 
@@ -45,21 +49,16 @@ class Extrinsics:
     """Collects static transforms and the frames of the sensors, and completes the parameters with what they tell.
 
     Reading is a matter of the first messages: afterwards nothing changes, and nothing is looked up any more.
-
-    Attributes:
-        sensors: those this robot has.
     """
 
     def __init__(self, parameters: Parameters) -> None:
         """`parameters` as somebody gave them: what is not zero there is not looked up."""
         self._base_link = parameters.frames.base_link
         values = to_mapping(parameters)
-        self.sensors = [s for s in PLACES if s != SECOND_ANTENNA or parameters.second_gnss.frame_id]
         self._wanted: set[str] = set()
         if parameters.frames.extrinsics == "auto":
-            for sensor in self.sensors:
-                names = (PLACES[sensor].position, PLACES[sensor].rotation)
-                if not np.any([values[name] for name in names if name]):
+            for sensor, place in PLACES.items():
+                if not any(np.any(values[name]) for name in (place.position, place.rotation) if name):
                     self._wanted.add(sensor)
         self._parents: dict[str, tuple[str, Pose]] = {}
         self._frames: dict[str, list[str]] = {}
@@ -75,9 +74,19 @@ class Extrinsics:
             pose = position, matrix_of(*(quaternion / norm))
             self._parents[message.child_frame_id] = message.header.frame_id, pose
 
-    def note_frame(self, sensor: str, frame: str) -> None:
-        """Take note of a frame that a sensor's messages name; the first one that is known counts."""
-        self._frames.setdefault(sensor, []).append(frame)
+    @property
+    def sensors(self) -> list[str]:
+        """Those that every robot has, and those that messages came from."""
+        return [sensor for sensor in PLACES if sensor in (IMU, ANTENNA, *self._frames)]
+
+    def note_frame(self, sensor: str, frame: str) -> bool:
+        """Take note of a frame that a sensor's messages name; the first one that is known counts.
+
+        Says whether it is the first frame of this sensor at all.
+        """
+        frames = self._frames.setdefault(sensor, [])
+        frames.append(frame)
+        return len(frames) == 1
 
     def find(self) -> list[str]:
         """Look for the sensors not found so far; return a line for each that was found now."""
@@ -100,7 +109,8 @@ class Extrinsics:
     def completed(self, parameters: Parameters) -> Parameters:
         """The parameters with the places that were found."""
         for sensor, (position, rotation) in self._found.items():
-            parameters = _changed(parameters, PLACES[sensor].position, position)
+            if PLACES[sensor].position:
+                parameters = _changed(parameters, PLACES[sensor].position, position)
             if PLACES[sensor].rotation:
                 parameters = _changed(parameters, PLACES[sensor].rotation, roll_pitch_yaw_deg(rotation))
         return parameters

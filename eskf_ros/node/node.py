@@ -365,7 +365,7 @@ class EskfNode(Node):
     def _on_static_transforms(self, message: Any) -> None:
         for transform in message.transforms:
             self.extrinsics.note_transform(transform)
-        self._complete_extrinsics()
+        self._complete_extrinsics(is_late=True)
 
     def _meet_frame(self, met: set[Any], key: object, place: str, frame: str) -> None:
         """Take note of a frame name that an input has not used before."""
@@ -373,16 +373,17 @@ class EskfNode(Node):
             return
         met.add(key)
         if place:
-            self.extrinsics.note_frame(place, frame)
-            self._complete_extrinsics()
+            is_first = self.extrinsics.note_frame(place, frame)
+            self._complete_extrinsics(is_late=not is_first)
 
-    def _complete_extrinsics(self) -> None:
+    def _complete_extrinsics(self, is_late: bool) -> None:
+        """Use the places that can be found now; start again if earlier messages were taken for those of elsewhere."""
         found = self.extrinsics.find()
         for line in found:
             self.get_logger().info(line)
         if found:
             self._configure(self._live.current)
-            if self.navigator.status > Status.LEVELLING:
+            if is_late and self.navigator.status > Status.LEVELLING:
                 self._reset("the place of a sensor has become known")
 
     def _read_memory(self) -> Memory | None:
