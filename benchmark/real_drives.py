@@ -1,9 +1,9 @@
-"""Two real drives through `eskf_replay`; writes the figures of docs/results.md and draws docs/real_drives.png.
+"""Real drives through `eskf_replay`; writes the figures of docs/results.md and draws docs/real_drives.png.
 
-    python benchmark/real_drives.py [--keep DIR]
+    python benchmark/real_drives.py [--keep DIR] [DRIVE ...]
 
-Needs gtsam for KITTI, and drive_0708 below $ESKF_DATA or in shared/data beside the checkout (docs/results.md says where
-both come from). `--keep` leaves the recordings, parameter files and last results in DIR.
+Needs gtsam for KITTI, and the other drives below $ESKF_DATA or in shared/data beside the checkout (docs/results.md says
+where they come from). `--keep` leaves the recordings, parameter files and last results in DIR.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import argparse
 import math
 import sys
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,25 +34,38 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "test"))
 
 from conftest import find_data_folder  # noqa: E402
-from real_recordings import (  # noqa: E402
-    FIX,
-    OUTAGE_LENGTH,
-    OUTAGE_SETS,
-    Recording,
-    drive_0708_recording,
-    kitti_recording,
-    replayed,
-    results_folder,
-)
+from recordings import drive_0708, tsukishima  # noqa: E402
+from recordings.common import FIX, ODOMETRY, Outages, Recording, replayed, results_folder  # noqa: E402
+from recordings.kitti import kitti_recording  # noqa: E402
 
 Array = NDArray[np.float64]
 
 RESULTS = ROOT / "docs" / "results.md"
 FIGURE = ROOT / "docs" / "real_drives.png"
-MARKERS = ("<!-- figures: written by benchmark/real_drives.py -->\n", "<!-- end of figures -->\n")
-ODOMETRY = "nav_msgs/msg/Odometry"
 ODOMETRY_TOPIC = "odometry/global"
 AXES = ("horizontal", "vertical")
+HEADINGS = ("input", "horizontal, m", "vertical, m", "NIS", "NEES", "outside the gate", "restarts")
+OUTAGE_HEADINGS = ("input", "outages", "horizontal, m", "vertical, m", "inside the 95 % ellipse", "restarts")
+END_TOLERANCE = 1.0
+"""An outage counts when there is truth in its last second."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A row of a table: what the estimator is given, as lines added to the parameter file."""
+
+    label: str
+    lines: tuple[str, ...] = ()
+    chosen_noise: bool = True
+
+
+NOISES = (Variant("chosen noise"), Variant("default noise", chosen_noise=False))
+TSUKISHIMA = (
+    Variant("position only", ("gnss.use_velocity: false",)),
+    Variant("position only, default noise", ("gnss.use_velocity: false",), chosen_noise=False),
+    Variant("with velocity"),
+    Variant("with velocity, default noise", chosen_noise=False),
+)
 
 
 @dataclass(frozen=True)
@@ -67,12 +80,17 @@ class Replay:
     error: Array
     covariance: Array
 
-    def ends_inside(self) -> int:
-        """How many outages end with the true position inside the 95 % ellipse of the estimate."""
-        ends = [outage["start"] + outage["length"] for outage in self.summary["outages"]]
-        last = np.searchsorted(self.seconds, ends, side="right") - 1
-        solved = np.linalg.solve(self.covariance[last], self.error[last][:, :, None])[:, :, 0]
-        return int((np.einsum("ni,ni->n", self.error[last], solved) <= chi2.ppf(0.95, 2)).sum())
+    def known_ends(self) -> list[dict[str, Any]]:
+        """The outages that have truth at their end, and `inside`: is it in the 95 % ellipse of the estimate?"""
+        known = []
+        for outage in self.summary["outages"]:
+            end = outage["start"] + outage["length"]
+            last = np.searchsorted(self.seconds, end, side="right") - 1
+            if outage["horizontal"] is None or self.seconds[last] < end - END_TOLERANCE:
+                continue
+            nees = self.error[last] @ np.linalg.solve(self.covariance[last], self.error[last])
+            known.append({**outage, "inside": nees <= chi2.ppf(0.95, 2)})
+        return known
 
 
 def main() -> int:
@@ -80,76 +98,107 @@ def main() -> int:
     assert __doc__ is not None
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--keep", type=Path, metavar="DIR", help="leave recordings and results here")
+    parser.add_argument("drives", nargs="*", choices=[*DRIVES, []], metavar="DRIVE", help=f"one of {', '.join(DRIVES)}")
     options = parser.parse_args()
-    text = RESULTS.read_text(encoding="utf-8")
     with tempfile.TemporaryDirectory() as temporary:
-        folder = options.keep or Path(temporary)
-        try:
-            kitti = [kitti_recording(folder, with_velocity) for with_velocity in (False, True)]
-            source = find_data_folder("drive_0708")
-        except (ModuleNotFoundError, FileNotFoundError) as missing:
-            print(f"real_drives: {missing}", file=sys.stderr)
-            return 2
-        drive = [drive_0708_recording(folder, source, with_velocity) for with_velocity in (False, True)]
-        content = figures(kitti, drive)
-    print(content)
-    RESULTS.write_text(between_markers(text, content), encoding="utf-8")
+        for name in options.drives or DRIVES:
+            try:
+                content = DRIVES[name](options.keep or Path(temporary))
+            except (ModuleNotFoundError, FileNotFoundError) as missing:
+                print(f"real_drives: {missing}", file=sys.stderr)
+                return 2
+            print(content)
+            text = RESULTS.read_text(encoding="utf-8")
+            RESULTS.write_text(between_markers(text, name, content), encoding="utf-8")
     return 0
 
 
-def figures(kitti: Sequence[Recording], drive: Sequence[Recording]) -> str:
-    """The tables of docs/results.md; each pair of recordings is without and with velocity. Draws the figure."""
-    rows = {"KITTI": [], "drive_0708": []}  # type: dict[str, list[list[str]]]
-    outage_rows, drawn = [], []
-    for name, pair in (("KITTI", kitti), ("drive_0708", drive)):
-        for aids, recording in zip(("position only", "with velocity"), pair, strict=True):
-            for noise, config in (("chosen", recording.config), ("default", recording.default_config)):
-                label = f"{aids}, {noise} noise"
-                rows[name].append(error_row(label, replayed(recording.bag, config)))
-                if name == "drive_0708":
-                    replays = [replay_with_outages(recording, config, starts) for starts in OUTAGE_SETS]
-                    outage_rows.append(outage_row(label, replays))
-                    if noise == "chosen":
-                        drawn.append((label, replays[0]))
+def kitti_figures(folder: Path) -> str:
+    """Errors between fixes ten seconds apart."""
+    rows = []
+    for aids, with_velocity in (("position only", False), ("with velocity", True)):
+        recording = kitti_recording(folder, with_velocity)
+        for noise in NOISES:
+            summary = replayed(recording, chosen_noise=noise.chosen_noise)
+            rows.append(error_row(f"{aids}, {noise.label}", summary))
+    return table(HEADINGS, rows)
+
+
+def drive_0708_figures(folder: Path) -> str:
+    """Errors between fixes one second apart, and at the end of outages."""
+    source = find_data_folder("drive_0708")
+    rows, outage_rows, drawn = [], [], []
+    for aids, with_velocity in (("position only", False), ("with velocity", True)):
+        recording = drive_0708.drive_0708_recording(folder, source, with_velocity)
+        for noise in NOISES:
+            label = f"{aids}, {noise.label}"
+            rows.append(error_row(label, replayed(recording, chosen_noise=noise.chosen_noise)))
+            replays = [replay_with_outages(recording, noise, outages) for outages in drive_0708.OUTAGE_SETS]
+            outage_rows.append(outage_row(label, replays))
+            if noise.chosen_noise:
+                drawn.append((label, replays[0]))
     draw(drawn)
-    headings = ["input", "horizontal, m", "vertical, m", "NIS", "NEES", "outside the gate", "restarts"]
-    outage_headings = ["input", "outages", "horizontal, m", "vertical, m", "inside the 95 % ellipse", "restarts"]
     return (
-        "\n### KITTI: between fixes ten seconds apart\n\n"
-        + table(headings, rows["KITTI"])
-        + "\n### drive_0708: between fixes one second apart\n\n"
-        + table(headings, rows["drive_0708"])
-        + f"\n### drive_0708: at the end of outages of {OUTAGE_LENGTH:g} s\n\n"
-        + table(outage_headings, outage_rows)
-        + "\n"
+        f"Between fixes one second apart:\n\n{table(HEADINGS, rows)}\n"
+        f"At the end of outages of {drive_0708.OUTAGE_LENGTH:g} s:\n\n{table(OUTAGE_HEADINGS, outage_rows)}"
     )
+
+
+def tsukishima_figures(folder: Path) -> str:
+    """Errors between fixes one second apart, and at the end of outages."""
+    recording = tsukishima.tsukishima_recording(folder, find_data_folder("tsukishima_20201105"))
+    rows, outage_rows = [], []
+    for variant in TSUKISHIMA:
+        summary = replayed(recording, *variant.lines, chosen_noise=variant.chosen_noise)
+        rows.append(error_row(variant.label, summary))
+        replays = [replay_with_outages(recording, variant, outages) for outages in tsukishima.OUTAGE_SETS]
+        outage_rows.append(outage_row(variant.label, replays))
+    return (
+        f"Between fixes one second apart:\n\n{table(HEADINGS, rows)}\n"
+        f"At the end of outages of {tsukishima.OUTAGE_LENGTH:g} s:\n\n{table(OUTAGE_HEADINGS, outage_rows)}"
+    )
+
+
+DRIVES: dict[str, Callable[[Path], str]] = {
+    "kitti": kitti_figures,
+    "drive_0708": drive_0708_figures,
+    "tsukishima": tsukishima_figures,
+}
 
 
 def error_row(label: str, summary: dict[str, Any]) -> list[str]:
     """Errors against truth and what became of the aids, position before velocity."""
-    aids = [aid for aid in summary["aids"].values() if aid["offered"]]
     nees = summary["nees"]["position"]
     return [
         label,
         *(metres(summary["error"][axis][key] for key in ("rms", "p50", "p95", "max")) for axis in AXES),
-        "; ".join(f"{aid['nis_mean']:.2f}, {aid['nis_in_95']:.1%}" for aid in aids),
+        *aid_cells(summary)[:1],
         f"{nees['mean']:.2f}, {nees['in_95']:.1%}",
+        *aid_cells(summary)[1:],
+        str(summary["restarts"]),
+    ]
+
+
+def aid_cells(summary: dict[str, Any]) -> list[str]:
+    """NIS, and how many were outside the gate, of the aids that were judged."""
+    aids = [aid for aid in summary["aids"].values() if aid["nis_mean"] is not None]
+    return [
+        "; ".join(f"{aid['nis_mean']:.2f}, {aid['nis_in_95']:.1%}" for aid in aids),
         "; ".join(
             f"{aid['verdicts'].get('gate', 0) + aid['verdicts'].get('weighed_down', 0)} of {aid['offered']}"
             for aid in aids
         ),
-        str(summary["restarts"]),
     ]
 
 
 def outage_row(label: str, replays: Sequence[Replay]) -> list[str]:
     """Errors at the end of all outages of several replays."""
-    outages = [outage for replay in replays for outage in replay.summary["outages"]]
+    outages = [outage for replay in replays for outage in replay.known_ends()]
     cells = []
     for axis in AXES:
         errors = [outage[axis] for outage in outages]
         cells.append(metres([np.median(errors), np.percentile(errors, 95), max(errors)]))
-    inside = sum(replay.ends_inside() for replay in replays)
+    inside = sum(outage["inside"] for outage in outages)
     return [label, str(len(outages)), *cells, str(inside), str(sum(replay.summary["restarts"] for replay in replays))]
 
 
@@ -164,24 +213,25 @@ def table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
-def between_markers(text: str, content: str) -> str:
-    """`text` with `content` between the markers; raises ValueError when they are not there."""
-    before, begin, rest = text.partition(MARKERS[0])
-    _, end, after = rest.partition(MARKERS[1])
-    if not (begin and end):
-        raise ValueError(f"{RESULTS}: the lines {MARKERS[0].strip()!r} and {MARKERS[1].strip()!r} are missing")
-    return before + begin + content + end + after
+def between_markers(text: str, name: str, content: str) -> str:
+    """`text` with `content` between the markers of a drive; raises ValueError when they are not there."""
+    begin, end = f"<!-- figures of {name}: written by benchmark/real_drives.py -->\n", f"<!-- end of {name} -->\n"
+    before, begin_found, rest = text.partition(begin)
+    _, end_found, after = rest.partition(end)
+    if not (begin_found and end_found):
+        raise ValueError(f"{RESULTS}: the lines {begin.strip()!r} and {end.strip()!r} are missing")
+    return f"{before}{begin}\n{content}\n{end}{after}"
 
 
-def replay_with_outages(recording: Recording, config: Path, starts: Sequence[float]) -> Replay:
-    """Replay with outages from `starts` (s) and read back the published odometry."""
-    summary = replayed(recording.bag, config, starts)
+def replay_with_outages(recording: Recording, variant: Variant, outages: Outages) -> Replay:
+    """Replay with outages and read back the published odometry."""
+    summary = replayed(recording, *variant.lines, outages=outages, chosen_noise=variant.chosen_noise)
     estimate = read(results_folder(recording.bag) / "odometry.mcap", ODOMETRY_TOPIC, ODOMETRY)
     truth = read(recording.bag, "/truth", FIX)
     first = int(read(recording.bag, "/imu/data", "sensor_msgs/msg/Imu")["stamp"][0])
     truth = truth[(truth["stamp"] >= estimate["stamp"][0]) & (truth["stamp"] <= estimate["stamp"][-1])]
 
-    lever_arm = parameters.load(config).gnss.lever_arm
+    lever_arm = parameters.load(recording.config(variant.lines, variant.chosen_noise)).gnss.lever_arm
     antenna = estimate["position"] + Rotation.from_quat(estimate["orientation"]).apply(lever_arm)
     datum = MapFrame(tuple(summary["datum"]))
     truth_ecef = np.array(
@@ -218,7 +268,7 @@ def draw(replays: Sequence[tuple[str, Replay]]) -> None:
         panel.semilogy(replay.seconds, error, ".", color="tab:blue", markersize=2, label="error")
         panel.set_ylim(1e-3, 1e3)
         panel.set_ylabel("horizontal, m")
-        panel.set_title(f"drive_0708, {label}: outages of {OUTAGE_LENGTH:g} s in grey", fontsize=10)
+        panel.set_title(f"drive_0708, {label}: outages of {drive_0708.OUTAGE_LENGTH:g} s in grey", fontsize=10)
     panels[0, 0].legend(loc="upper right", ncols=2, fontsize=8)
     panels[-1, 0].set_xlabel("s")
     figure.savefig(FIGURE, dpi=70)

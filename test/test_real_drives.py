@@ -1,4 +1,4 @@
-"""Two real drives through `eskf_replay`: the figures of docs/results.md with a quarter of margin.
+"""Real drives through `eskf_replay`: the figures of docs/results.md with a quarter of margin.
 
 Within the margin: other roundings, another numba. Beyond it: an estimator that got worse.
 """
@@ -11,7 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from real_recordings import OUTAGE_SETS, Recording, drive_0708_recording, kitti_recording, replayed
+from recordings.common import Recording, replayed
+from recordings.drive_0708 import OUTAGE_SETS, drive_0708_recording
+from recordings.kitti import kitti_recording
+from recordings.tsukishima import tsukishima_recording
 
 MARGIN = 1.25
 BEFORE_ALIGNMENT = 6
@@ -68,7 +71,7 @@ def outage_errors(summaries: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarr
 
 def test_kitti_with_a_position_every_ten_seconds(kitti: Callable[[bool], Recording]) -> None:
     recording = kitti(False)
-    summary = replayed(recording.bag, recording.config)
+    summary = replayed(recording)
     assert_never_lost(summary)
     assert summary["truth"]["compared"] > 270
     assert_within(summary, "horizontal", rms=4.98, p50=0.46, p95=12.0, max=29.3)
@@ -78,7 +81,7 @@ def test_kitti_with_a_position_every_ten_seconds(kitti: Callable[[bool], Recordi
 
 def test_kitti_with_velocity_every_ten_seconds(kitti: Callable[[bool], Recording]) -> None:
     recording = kitti(True)
-    summary = replayed(recording.bag, recording.config)
+    summary = replayed(recording)
     assert_never_lost(summary)
     assert_within(summary, "horizontal", rms=2.32, p50=0.34, p95=4.7, max=18.7)
     assert_within(summary, "vertical", rms=0.46, p50=0.17, p95=0.95, max=2.4)
@@ -88,7 +91,7 @@ def test_kitti_with_velocity_every_ten_seconds(kitti: Callable[[bool], Recording
 def test_drive_0708_between_fixes(drive_0708: Callable[[bool], Recording]) -> None:
     for with_velocity in (False, True):
         recording = drive_0708(with_velocity)
-        summary = replayed(recording.bag, recording.config)
+        summary = replayed(recording)
         assert_never_lost(summary)
         assert summary["truth"]["compared"] > 1500
         assert_within(summary, "horizontal", rms=0.031, p50=0.013, p95=0.046, max=0.48)
@@ -108,7 +111,7 @@ def test_drive_0708_after_outages(
     most: tuple[float, float],
 ) -> None:
     recording = drive_0708(with_velocity)
-    summaries = [replayed(recording.bag, recording.config, starts) for starts in OUTAGE_SETS]
+    summaries = [replayed(recording, outages=outages) for outages in OUTAGE_SETS]
     for summary in summaries:
         assert_never_lost(summary)
         assert_consistent(summary, nees_in_95=0.95, nis_in_95=0.95)
@@ -118,14 +121,14 @@ def test_drive_0708_after_outages(
 
 
 def test_velocity_halves_the_error_between_fixes(kitti: Callable[[bool], Recording]) -> None:
-    without, with_velocity = (replayed(recording.bag, recording.config) for recording in map(kitti, (False, True)))
+    without, with_velocity = (replayed(recording) for recording in map(kitti, (False, True)))
     assert with_velocity["error"]["horizontal"]["rms"] < 0.6 * without["error"]["horizontal"]["rms"]
 
 
 def test_kitti_with_default_noise_is_never_lost(kitti: Callable[[bool], Recording]) -> None:
     for with_velocity, rms, most in ((False, 5.4, 13.6), (True, 2.7, 4.9)):
         recording = kitti(with_velocity)
-        summary = replayed(recording.bag, recording.default_config)
+        summary = replayed(recording, chosen_noise=False)
         assert_never_lost(summary)
         assert_within(summary, "horizontal", rms=rms, p95=most)
 
@@ -133,9 +136,20 @@ def test_kitti_with_default_noise_is_never_lost(kitti: Callable[[bool], Recordin
 def test_drive_0708_with_default_noise_is_never_lost(drive_0708: Callable[[bool], Recording]) -> None:
     for with_velocity in (False, True):
         recording = drive_0708(with_velocity)
-        summary = replayed(recording.bag, recording.default_config)
+        summary = replayed(recording, chosen_noise=False)
         assert_never_lost(summary)
         # A gyro that reads 1 deg/s too much for three seconds is more than the default noise says.
         assert_within(summary, "horizontal", rms=0.060, p50=0.017, p95=0.07, max=0.8)
-        for starts in OUTAGE_SETS:
-            assert_never_lost(replayed(recording.bag, recording.default_config, starts))
+        for outages in OUTAGE_SETS:
+            assert_never_lost(replayed(recording, outages=outages, chosen_noise=False))
+
+
+def test_tsukishima_is_never_lost_among_wrong_fixes(tmp_path: Path, data_folder: Callable[[str], Path]) -> None:
+    recording = tsukishima_recording(tmp_path, data_folder("tsukishima_20201105"))
+    for lines, rms, most in ((("gnss.use_velocity: false",), 0.22, 6.8), ((), 0.17, 2.4)):
+        summary = replayed(recording, *lines)
+        assert_never_lost(summary)
+        assert summary["truth"]["compared"] > 4200
+        assert_within(summary, "horizontal", rms=rms, p50=0.075, p95=0.33, max=most)
+        assert_within(summary, "vertical", rms=0.19, p50=0.071, p95=0.24)
+        assert summary["nees"]["position"]["in_95"] > 0.95
