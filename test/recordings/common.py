@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from eskf_ros import earth
 from eskf_ros.bags import BagWriter, message_dtype
@@ -22,6 +23,7 @@ IMU = "sensor_msgs/msg/Imu"
 FIX = "sensor_msgs/msg/NavSatFix"
 VELOCITY = "geometry_msgs/msg/TwistWithCovarianceStamped"
 ODOMETRY = "nav_msgs/msg/Odometry"
+MAGNETIC_FIELD = "sensor_msgs/msg/MagneticField"
 FRAMES = ("base_link", "imu_link", "gps", "odom", "earth")
 BASE_FRAME, IMU_FRAME, GNSS_FRAME, ODOM_FRAME, EARTH_FRAME = range(len(FRAMES))
 GNSS_LATENCY = 0.1
@@ -70,15 +72,19 @@ class Messages:
 
 @dataclass(frozen=True)
 class Fixes:
-    """Positions of the antenna: time (n,) in s, geodetic (n, 3) in deg, deg, m, covariance (n, 3, 3) ENU in m2."""
+    """Positions of the antenna: time (n,) in s, geodetic (n, 3) in deg, deg, m, covariance (n, 3, 3) ENU in m2.
+
+    Without `covariance` the messages say that it is unknown.
+    """
 
     time: Array
     geodetic: Array
-    covariance: Array
+    covariance: Array | None
     status: NDArray[np.int8]
 
     def __getitem__(self, chosen: NDArray[np.bool_]) -> Fixes:
-        return Fixes(self.time[chosen], self.geodetic[chosen], self.covariance[chosen], self.status[chosen])
+        covariance = None if self.covariance is None else self.covariance[chosen]
+        return Fixes(self.time[chosen], self.geodetic[chosen], covariance, self.status[chosen])
 
 
 def diagonal(std: Array) -> Array:
@@ -128,15 +134,19 @@ def gnss_fix(fixes: Fixes, time_offset: float) -> Messages:
     return Messages("gps/fix", FIX, fixes.time + time_offset + GNSS_LATENCY, _fix_messages(fixes, 0.0))
 
 
-def gnss_velocity(time: Array, velocity_enu: Array, std: Array, arrival: Array) -> Messages:
-    """`gps/vel` of East-North-Up velocities (n, 3) in m/s with std (n, 3), stamped `time` (n,), known at `arrival`."""
+def gnss_velocity(time: Array, velocity_enu: Array, std: Array | None, arrival: Array) -> Messages:
+    """`gps/vel` of East-North-Up velocities (n, 3) in m/s, stamped `time` (n,), known at `arrival`.
+
+    With standard deviations `std` (n, 3), or a covariance that is all zero.
+    """
     messages = np.zeros(len(time), message_dtype(VELOCITY))
     messages["stamp"] = nanoseconds(time)
     messages["frame_id"] = GNSS_FRAME
     messages["linear_velocity"] = velocity_enu
-    # The diagonal of the linear block; a receiver does not measure rotation.
-    messages["twist_covariance"][:, [0, 7, 14]] = std**2
-    messages["twist_covariance"][:, 21] = ABSENT
+    if std is not None:
+        # The diagonal of the linear block; a receiver does not measure rotation.
+        messages["twist_covariance"][:, [0, 7, 14]] = std**2
+        messages["twist_covariance"][:, 21] = ABSENT
     return Messages("gps/vel", VELOCITY, arrival, messages)
 
 
@@ -152,6 +162,26 @@ def wheel(time: Array, speed: Array, speed_std: float, arrival: Array) -> Messag
     return Messages("wheel/odom", ODOMETRY, arrival, messages)
 
 
+def magnetic_field(time: Array, field: Array) -> Messages:
+    """`imu/mag` of the field (n, 3) in tesla, base_link axes; its covariance is unknown."""
+    messages = np.zeros(len(time), message_dtype(MAGNETIC_FIELD))
+    messages["stamp"] = nanoseconds(time)
+    messages["frame_id"] = BASE_FRAME
+    messages["magnetic_field"] = field
+    return Messages("imu/mag", MAGNETIC_FIELD, time + IMU_LATENCY, messages)
+
+
+def pose_in_earth(topic: str, time: Array, position_ecef: Array, body_to_ecef: Array, speed: Array) -> Messages:
+    """Odometry of base_link in ECEF: positions (n, 3), rotations (n, 3, 3), speeds (n,), stamps on the IMU's clock."""
+    messages = np.zeros(len(time), message_dtype(ODOMETRY))
+    messages["stamp"] = nanoseconds(time)
+    messages["frame_id"], messages["child_frame_id"] = EARTH_FRAME, BASE_FRAME
+    messages["position"] = position_ecef
+    messages["orientation"] = Rotation.from_matrix(body_to_ecef).as_quat()
+    messages["linear_velocity"][:, 0] = speed
+    return Messages(topic, ODOMETRY, time, messages)
+
+
 def truth_fix(fixes: Fixes, time_offset: float) -> Messages:
     """`truth`: positions of the antenna, their stamps moved to the clock of the IMU."""
     return Messages("truth", FIX, fixes.time + time_offset, _fix_messages(fixes, time_offset))
@@ -164,8 +194,9 @@ def _fix_messages(fixes: Fixes, added_time: float) -> NDArray[Any]:
     messages["status"] = fixes.status
     messages["service"] = 1
     messages["latitude"], messages["longitude"], messages["altitude"] = fixes.geodetic.T
-    messages["position_covariance"] = fixes.covariance.reshape(-1, 9)
-    messages["position_covariance_type"] = COVARIANCE_KNOWN
+    if fixes.covariance is not None:
+        messages["position_covariance"] = fixes.covariance.reshape(-1, 9)
+        messages["position_covariance_type"] = COVARIANCE_KNOWN
     return messages
 
 
