@@ -34,9 +34,11 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "test"))
 
 from conftest import find_data_folder  # noqa: E402
-from recordings import drive_0708, tsukishima  # noqa: E402
-from recordings.common import FIX, ODOMETRY, Outages, Recording, replayed, results_folder  # noqa: E402
+from recordings import drive_0708, husky, tsukishima, walk  # noqa: E402
+from recordings.common import FIX, IMU, ODOMETRY, Outages, Recording, replayed, results_folder  # noqa: E402
 from recordings.kitti import kitti_recording  # noqa: E402
+from recordings.nagoya import nagoya_recording  # noqa: E402
+from recordings.thor75 import thor75_recording  # noqa: E402
 
 Array = NDArray[np.float64]
 
@@ -44,7 +46,11 @@ RESULTS = ROOT / "docs" / "results.md"
 FIGURE = ROOT / "docs" / "real_drives.png"
 ODOMETRY_TOPIC = "odometry/global"
 AXES = ("horizontal", "vertical")
+STATISTICS = ("rms", "p50", "p95", "max")
 HEADINGS = ("input", "horizontal, m", "vertical, m", "NIS", "NEES", "outside the gate", "restarts")
+PEER_HEADINGS = ("input", "horizontal, m", "vertical, m", "speed, m/s", "heading, deg", "NIS", "restarts")
+COURSE_HEADINGS = ("input", "heading known", "heading off the course, deg", "NIS", "restarts", "state at the end")
+NAGOYA_HEADINGS = ("IMU, input", *HEADINGS[1:3], "heading, deg", "NIS", "NEES position; attitude", *HEADINGS[5:])
 OUTAGE_HEADINGS = ("input", "outages", "horizontal, m", "vertical, m", "inside the 95 % ellipse", "restarts")
 END_TOLERANCE = 1.0
 """An outage counts when there is truth in its last second."""
@@ -60,12 +66,22 @@ class Variant:
 
 
 NOISES = (Variant("chosen noise"), Variant("default noise", chosen_noise=False))
+INPUTS = (Variant("position only", ("gnss.use_velocity: false",)), Variant("with velocity"))
 TSUKISHIMA = (
     Variant("position only", ("gnss.use_velocity: false",)),
     Variant("position only, default noise", ("gnss.use_velocity: false",), chosen_noise=False),
     Variant("with velocity"),
     Variant("with velocity, default noise", chosen_noise=False),
 )
+HUSKY = (
+    Variant("default noise", chosen_noise=False),
+    Variant("chosen noise"),
+    Variant("heading given, default noise", husky.HEADING, chosen_noise=False),
+    Variant("heading given, chosen noise", husky.HEADING),
+)
+NAGOYA_GRADES = ("consumer", "industrial", "tactical")
+KNOWN_HEADING_DEG = 30.0
+"""Standard deviation below which a heading counts as known."""
 
 
 @dataclass(frozen=True)
@@ -149,8 +165,7 @@ def tsukishima_figures(folder: Path) -> str:
     recording = tsukishima.tsukishima_recording(folder, find_data_folder("tsukishima_20201105"))
     rows, outage_rows = [], []
     for variant in TSUKISHIMA:
-        summary = replayed(recording, *variant.lines, chosen_noise=variant.chosen_noise)
-        rows.append(error_row(variant.label, summary))
+        rows.append(variant_row(recording, variant))
         replays = [replay_with_outages(recording, variant, outages) for outages in tsukishima.OUTAGE_SETS]
         outage_rows.append(outage_row(variant.label, replays))
     return (
@@ -159,36 +174,100 @@ def tsukishima_figures(folder: Path) -> str:
     )
 
 
+def thor75_figures(folder: Path) -> str:
+    """Differences to the filter on board."""
+    recording = thor75_recording(folder, find_data_folder("thor75_flight"))
+    rows = []
+    for variant in INPUTS:
+        summary = replayed(recording, *variant.lines, truth="peer")
+        errors = [numbers(summary["error"][key], STATISTICS) for key in (*AXES, "speed", "heading_deg")]
+        rows.append([variant.label, *errors, aid_cells(summary)[0], str(summary["restarts"])])
+    return table(PEER_HEADINGS, rows)
+
+
+def husky_figures(folder: Path) -> str:
+    """What becomes of the heading: it is compared with the course over ground of the fixes."""
+    recording = husky.husky_recording(folder, find_data_folder("husky_test1"))
+    rows = []
+    for variant in HUSKY:
+        summary = replayed(recording, *variant.lines, chosen_noise=variant.chosen_noise, truth="")
+        estimate = read(results_folder(recording.bag) / "odometry.mcap", ODOMETRY_TOPIC, ODOMETRY)
+        time, course = husky.course(
+            read(recording.bag, "/fix", FIX), read(recording.bag, "/husky_velocity_controller/odom", ODOMETRY)
+        )
+        row = np.minimum(np.searchsorted(estimate["stamp"], time), len(estimate) - 1)
+        known = estimate["pose_covariance"][row, 35] < math.radians(KNOWN_HEADING_DEG) ** 2
+        yaw = Rotation.from_quat(estimate["orientation"][row]).as_euler("ZYX")[:, 0]
+        off = np.abs(np.degrees(np.angle(np.exp(1j * (yaw - course)))))[known]
+        percentiles = dict(zip(STATISTICS[1:], np.percentile(off, [50, 95, 100]), strict=True)) if len(off) else None
+        cells = [f"{known.mean():.0%} of the time", numbers(percentiles, STATISTICS[1:])]
+        end = summary["final"]["status"]
+        rows.append([variant.label, *cells, aid_cells(summary)[0], str(summary["restarts"]), end])
+    return table(COURSE_HEADINGS, rows)
+
+
+def walk_figures(folder: Path) -> str:
+    """Errors between fixes one second apart, and at the end of outages."""
+    recording = walk.walk_recording(folder, find_data_folder("walk_0827"))
+    text = f"Between fixes one second apart:\n\n{table(HEADINGS, [variant_row(recording, v) for v in INPUTS])}"
+    for length, outage_sets in walk.OUTAGE_SETS.items():
+        rows = [
+            outage_row(v.label, [replay_with_outages(recording, v, outages) for outages in outage_sets]) for v in INPUTS
+        ]
+        text += f"\nAt the end of outages of {length:g} s:\n\n{table(OUTAGE_HEADINGS, rows)}"
+    return text
+
+
+def nagoya_figures(folder: Path) -> str:
+    """Errors against the true trajectory, by grade of the simulated IMU."""
+    rows = []
+    for grade in NAGOYA_GRADES:
+        recording = nagoya_recording(folder, find_data_folder("nagoya_20240720"), grade)
+        for variant in INPUTS:
+            summary = replayed(recording, *variant.lines)
+            nis, outside = aid_cells(summary)
+            errors = [numbers(summary["error"][key], STATISTICS) for key in (*AXES, "heading_deg")]
+            nees = "; ".join(consistency(summary["nees"][key]) for key in ("position", "attitude"))
+            rows.append([f"{grade}, {variant.label}", *errors, nis, nees, outside, str(summary["restarts"])])
+    return table(NAGOYA_HEADINGS, rows)
+
+
 DRIVES: dict[str, Callable[[Path], str]] = {
     "kitti": kitti_figures,
     "drive_0708": drive_0708_figures,
     "tsukishima": tsukishima_figures,
+    "thor75": thor75_figures,
+    "husky": husky_figures,
+    "walk": walk_figures,
+    "nagoya": nagoya_figures,
 }
+
+
+def variant_row(recording: Recording, variant: Variant) -> list[str]:
+    """Errors of a replay."""
+    return error_row(variant.label, replayed(recording, *variant.lines, chosen_noise=variant.chosen_noise))
 
 
 def error_row(label: str, summary: dict[str, Any]) -> list[str]:
     """Errors against truth and what became of the aids, position before velocity."""
-    nees = summary["nees"]["position"]
-    return [
-        label,
-        *(metres(summary["error"][axis][key] for key in ("rms", "p50", "p95", "max")) for axis in AXES),
-        *aid_cells(summary)[:1],
-        f"{nees['mean']:.2f}, {nees['in_95']:.1%}",
-        *aid_cells(summary)[1:],
-        str(summary["restarts"]),
-    ]
+    nis, outside = aid_cells(summary)
+    errors = [numbers(summary["error"][axis], STATISTICS) for axis in AXES]
+    return [label, *errors, nis, consistency(summary["nees"]["position"]), outside, str(summary["restarts"])]
 
 
-def aid_cells(summary: dict[str, Any]) -> list[str]:
+def aid_cells(summary: dict[str, Any]) -> tuple[str, str]:
     """NIS, and how many were outside the gate, of the aids that were judged."""
     aids = [aid for aid in summary["aids"].values() if aid["nis_mean"] is not None]
-    return [
+    outside = [aid["verdicts"].get("gate", 0) + aid["verdicts"].get("weighed_down", 0) for aid in aids]
+    return (
         "; ".join(f"{aid['nis_mean']:.2f}, {aid['nis_in_95']:.1%}" for aid in aids),
-        "; ".join(
-            f"{aid['verdicts'].get('gate', 0) + aid['verdicts'].get('weighed_down', 0)} of {aid['offered']}"
-            for aid in aids
-        ),
-    ]
+        "; ".join(f"{count} of {aid['offered']}" for count, aid in zip(outside, aids, strict=True)),
+    )
+
+
+def consistency(nees: dict[str, float] | None) -> str:
+    """Mean and share inside the 95 % bound."""
+    return "-" if nees is None else f"{nees['mean']:.2f}, {nees['in_95']:.1%}"
 
 
 def outage_row(label: str, replays: Sequence[Replay]) -> list[str]:
@@ -197,13 +276,18 @@ def outage_row(label: str, replays: Sequence[Replay]) -> list[str]:
     cells = []
     for axis in AXES:
         errors = [outage[axis] for outage in outages]
-        cells.append(metres([np.median(errors), np.percentile(errors, 95), max(errors)]))
+        cells.append(cell([np.median(errors), np.percentile(errors, 95), max(errors)]))
     inside = sum(outage["inside"] for outage in outages)
     return [label, str(len(outages)), *cells, str(inside), str(sum(replay.summary["restarts"] for replay in replays))]
 
 
-def metres(values: Iterable[float]) -> str:
-    """Lengths in a cell: millimetres below a metre, centimetres above."""
+def numbers(error: dict[str, float] | None, keys: Iterable[str]) -> str:
+    """Statistics of an error in a cell; a dash when there is none."""
+    return "-" if error is None else cell(error[key] for key in keys)
+
+
+def cell(values: Iterable[float]) -> str:
+    """Numbers in a cell: three decimals below one, two above."""
     return " / ".join(f"{value:.3f}" if value < 1.0 else f"{value:.2f}" for value in values)
 
 
@@ -228,7 +312,7 @@ def replay_with_outages(recording: Recording, variant: Variant, outages: Outages
     summary = replayed(recording, *variant.lines, outages=outages, chosen_noise=variant.chosen_noise)
     estimate = read(results_folder(recording.bag) / "odometry.mcap", ODOMETRY_TOPIC, ODOMETRY)
     truth = read(recording.bag, "/truth", FIX)
-    first = int(read(recording.bag, "/imu/data", "sensor_msgs/msg/Imu")["stamp"][0])
+    first = int(read(recording.bag, "/imu/data", IMU)["stamp"][0])
     truth = truth[(truth["stamp"] >= estimate["stamp"][0]) & (truth["stamp"] <= estimate["stamp"][-1])]
 
     lever_arm = parameters.load(recording.config(variant.lines, variant.chosen_noise)).gnss.lever_arm

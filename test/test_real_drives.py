@@ -13,8 +13,12 @@ import numpy as np
 import pytest
 from recordings.common import Recording, replayed
 from recordings.drive_0708 import OUTAGE_SETS, drive_0708_recording
+from recordings.husky import husky_recording
 from recordings.kitti import kitti_recording
+from recordings.nagoya import nagoya_recording
+from recordings.thor75 import thor75_recording
 from recordings.tsukishima import tsukishima_recording
+from recordings.walk import walk_recording
 
 MARGIN = 1.25
 BEFORE_ALIGNMENT = 6
@@ -153,3 +157,39 @@ def test_tsukishima_is_never_lost_among_wrong_fixes(tmp_path: Path, data_folder:
         assert_within(summary, "horizontal", rms=rms, p50=0.075, p95=0.33, max=most)
         assert_within(summary, "vertical", rms=0.19, p50=0.071, p95=0.24)
         assert summary["nees"]["position"]["in_95"] > 0.95
+
+
+def test_thor75_agrees_with_the_filter_on_board(tmp_path: Path, data_folder: Callable[[str], Path]) -> None:
+    summary = replayed(thor75_recording(tmp_path, data_folder("thor75_flight")), truth="peer")
+    assert summary["restarts"] == 0
+    assert summary["truth"]["compared"] == summary["truth"]["heading_compared"] > 15_000
+    assert_within(summary, "horizontal", rms=1.03, p95=1.9)
+    assert_within(summary, "vertical", rms=1.18, p95=2.3)
+    assert_within(summary, "heading_deg", p50=0.38, p95=1.4)
+
+
+def test_husky_from_a_ros_1_bag(tmp_path: Path, data_folder: Callable[[str], Path]) -> None:
+    """Fixes of a metre and 1 m/s do not tell the heading; every fix is fused all the same."""
+    summary = replayed(husky_recording(tmp_path, data_folder("husky_test1")), truth="")
+    assert summary["warnings"] == []
+    fixes = summary["aids"]["gnss_position"]
+    assert fixes["offered"] == 989
+    assert fixes["fused"] + fixes["verdicts"]["before_alignment"] == 989
+    assert fixes["nis_mean"] < 3.0
+
+
+def test_walk_between_fixes(tmp_path: Path, data_folder: Callable[[str], Path]) -> None:
+    summary = replayed(walk_recording(tmp_path, data_folder("walk_0827")))
+    assert_never_lost(summary)
+    assert summary["truth"]["compared"] > 220
+    assert_within(summary, "horizontal", rms=0.048, p50=0.021, p95=0.074, max=0.37)
+    assert_within(summary, "vertical", rms=0.037, p50=0.022, p95=0.071)
+    assert_consistent(summary, nees_in_95=0.92, nis_in_95=0.90)
+
+
+def test_nagoya_with_real_fixes(tmp_path: Path, data_folder: Callable[[str], Path]) -> None:
+    """Fixes that are up to 184 m off on a drive whose trajectory is known."""
+    summary = replayed(nagoya_recording(tmp_path, data_folder("nagoya_20240720")))
+    assert summary["truth"]["compared"] > 5600
+    assert_within(summary, "horizontal", p50=1.86, p95=10.3, max=53.1)
+    assert_within(summary, "vertical", p50=1.4, p95=21.0)

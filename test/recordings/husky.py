@@ -16,8 +16,13 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
-from recordings.common import Recording
+import numpy as np
+from numpy.typing import NDArray
+
+from eskf_ros.simulate.map_frame import MapFrame
+from recordings.common import Array, Recording
 
 INSTALLATION = """\
 /**:
@@ -37,6 +42,10 @@ NOISE = """\
 HEADING = ("alignment.initial_heading_deg: 115.0", "alignment.initial_heading_std_deg: 20.0")
 """The course of the first fixes: at 1 m/s and with fixes of 1 m the heading is not found by itself."""
 
+HALF_WINDOW = 3_000_000_000
+LEAST_SPEED = 0.8
+LARGEST_TURN = 0.17
+
 
 def husky_recording(folder: Path, source: Path) -> Recording:
     """Convert the bag in `source` to `folder`."""
@@ -46,3 +55,23 @@ def husky_recording(folder: Path, source: Path) -> Recording:
     convert = [sys.executable, "-m", "rosbags.convert", "--src", str(source / "test1.bag"), "--dst", str(bag)]
     subprocess.run(convert, check=True)
     return Recording(bag, INSTALLATION, NOISE)
+
+
+def course(fixes: NDArray[Any], wheel: NDArray[Any]) -> tuple[NDArray[np.int64], Array]:
+    """Stamps (n,) and course over ground (n,), rad, 0 = east: of the fixes within 3 s, where the robot goes straight.
+
+    So it does where the wheels say at least 0.8 m/s and turn by no more than 10 deg.
+    """
+    place = MapFrame(tuple(float(fixes[name][0]) for name in ("latitude", "longitude", "altitude")))  # type: ignore[arg-type]
+    position = np.array([place.from_geodetic_deg(*p) for p in fixes[["latitude", "longitude", "altitude"]].tolist()])
+    stamps, courses = [], []
+    for stamp in fixes["stamp"][::5]:
+        near = np.abs(fixes["stamp"] - stamp) < HALF_WINDOW
+        rolling = np.abs(wheel["stamp"] - stamp) < HALF_WINDOW
+        turned = wheel["angular_velocity"][rolling, 2].mean() * 2e-9 * HALF_WINDOW
+        if wheel["linear_velocity"][rolling, 0].min() < LEAST_SPEED or abs(turned) > LARGEST_TURN:
+            continue
+        east, north, _ = np.polyfit((fixes["stamp"][near] - stamp) * 1e-9, position[near], 1)[0]
+        stamps.append(stamp)
+        courses.append(np.arctan2(north, east))
+    return np.array(stamps), np.array(courses)
