@@ -19,7 +19,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
         (f"share/{package_name}", ["package.xml"]),
         (f"share/{package_name}/config", sorted(glob("config/*.yaml"))),
-        (f"share/{package_name}/bags", sorted(glob("bags/*.mcap"))),
+        (f"share/{package_name}/bags", sorted(glob("bags/*.mcap") + glob("bags/*.nav"))),
         (f"share/{package_name}/launch", sorted(glob("launch/*.launch.py"))),
     ],
     python_requires=">=3.10",
@@ -59,6 +59,7 @@ setup(
         "console_scripts": [
             "eskf_node = eskf_ros.node.main:main",
             "eskf_replay = eskf_ros.replay.main:main",
+            "eskf_ranges = eskf_ros.ranges.main:main",
             "eskf_simulate = eskf_ros.simulate.main:main",
         ],
     },

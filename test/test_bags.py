@@ -113,7 +113,7 @@ def read(reader: BagReader, topics: dict[str, str]) -> dict[str, tuple[list[int]
         previous = max(int(part.log_time[-1]) for part in batch.values())
         for topic, part in batch.items():
             assert len(part.log_time) == len(part.messages) > 0
-            assert (np.diff(part.log_time) >= 0).all()
+            assert (part.log_time[1:] >= part.log_time[:-1]).all()
             result[topic][0].extend(part.log_time.tolist())
             result[topic][1].extend(flat(part.messages, part.strings))
     assert reader.bytes_done == reader.bytes_total

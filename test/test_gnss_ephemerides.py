@@ -245,7 +245,9 @@ def test_every_reason_not_to_use_a_range_is_named(tmp_path: Path) -> None:
     assert observed["flags"][6] & DOPPLER_VALID == 0
     late = epoch((Gnss.GPS, 5, "1C"))
     for week, seconds, status in (
-        (WEEK + 1, TOE, Status.STALE),
+        (WEEK, TOE + 43200.0, Status.STALE),
+        (WEEK + 1, TOE, Status.WRONG_WEEK),
+        (WEEK - 1024, TOE, Status.WRONG_WEEK),
         (WEEK, math.nan, Status.BAD_VALUE),
         (WEEK, 604800.0, Status.BAD_VALUE),
     ):

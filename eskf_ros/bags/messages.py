@@ -9,6 +9,8 @@ In memory a message is one row of `message_dtype(type_name)`:
 - a string is an int32: its index in a `StringTable`, because nearly all messages of a topic carry the same frame id;
 - everything else is the number or the fixed-length array of the definition (quaternions stay x y z w).
 
+Point clouds have as many points, and these as many fields, as the sender likes: `eskf_ros.bags.clouds`.
+
 On the wire (OMG CDR, the encoding of rosbag2): 4 bytes of encapsulation (00 01 00 00 little-endian, 00 00 00 00
 big-endian), then the fields, each aligned to its own size counted from byte 4; a string is a uint32 length that counts
 the closing NUL, then the bytes. So where a field lies depends only on the lengths of the strings before it, and
@@ -25,7 +27,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from eskf_ros.bags.clouds import CLOUD_DTYPE, POINT_CLOUD, decode_cloud, encode_cloud
 from eskf_ros.bags.errors import BagError
+from eskf_ros.bags.records import group_by_length
 
 _TIME = "time"
 _STRING = "string"
@@ -77,6 +81,7 @@ MESSAGE_TYPES: dict[str, tuple[Field, ...]] = {
     "geometry_msgs/msg/PoseWithCovarianceStamped": (*_HEADER, *_POSE),
     "nav_msgs/msg/Odometry": (*_HEADER, Field("child_frame_id", _STRING), *_POSE, *_TWIST),
 }
+"""The messages of fixed fields; that of `POINT_CLOUD` has fields of its own, see `eskf_ros.bags.clouds`."""
 
 
 class StringTable:
@@ -101,13 +106,15 @@ def _fields_of(type_name: str) -> tuple[Field, ...]:
     try:
         return MESSAGE_TYPES[type_name]
     except KeyError:
-        known = ", ".join(MESSAGE_TYPES)
+        known = ", ".join((*MESSAGE_TYPES, POINT_CLOUD))
         raise BagError(f"message type {type_name} is not one that can be read or written here ({known})") from None
 
 
 @cache
 def message_dtype(type_name: str) -> np.dtype[Any]:
-    """The structured dtype of one message in memory. Raises BagError for a type that is not in `MESSAGE_TYPES`."""
+    """The structured dtype of one message in memory. Raises BagError for a type that is not among those above."""
+    if type_name == POINT_CLOUD:
+        return CLOUD_DTYPE
     memory_code = {_TIME: "i8", _STRING: "i4"}
     return np.dtype(
         [
@@ -221,6 +228,10 @@ def decode(
     """
     messages = np.empty(rows.shape[0], message_dtype(type_name))
     valid = np.ones(rows.shape[0], bool)
+    if type_name == POINT_CLOUD:
+        for position, row in enumerate(rows):
+            valid[position] = decode_cloud(row, messages[position : position + 1], strings.index)
+        return messages, (None if valid.all() else valid)
     _decode_into(messages, valid, type_name, rows, strings)
     return messages, (None if valid.all() else valid)
 
@@ -324,7 +335,13 @@ def encode(type_name: str, messages: NDArray[Any], strings: Sequence[str]) -> ND
 def encode_groups(
     type_name: str, messages: NDArray[Any], strings: Sequence[str]
 ) -> Iterator[tuple[slice | NDArray[np.intp], NDArray[np.uint8]]]:
-    """As `encode`, but in groups of equal strings: yields (which messages, their bytes (m, length))."""
+    """As `encode`, but in groups of equal length: yields (which messages, their bytes (m, length))."""
+    if type_name == POINT_CLOUD:
+        payloads = [encode_cloud(message, strings[int(message["frame_id"])]) for message in messages]
+        if payloads:
+            for positions, rows in group_by_length(payloads):
+                yield slice(0, len(messages)) if positions is None else positions, rows
+        return
     names = [field.name for field in _fields_of(type_name) if field.code == _STRING]
     if not len(messages):
         return

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -120,6 +120,14 @@ class BagReader:
                     f"{self._sources[0].name}: topic {topic} is of type {self.topics[topic].type}, not {type_name}"
                 )
         return self._batches(topics)
+
+    def serialised(self, topics: Iterable[str]) -> Iterator[tuple[str, Payloads]]:
+        """Read the recording once and give out the messages as they are stored: (topic, messages) in no strict order.
+
+        Blocks come by their start, so that what is far apart in time comes in order. For topics of any type.
+        """
+        for _, block in self._blocks({topic: self.topics[topic].type for topic in topics}):
+            yield from block.load().items()
 
     def _batches(self, topics: Mapping[str, str]) -> Iterator[dict[str, Batch]]:
         self.bytes_done = 0

@@ -12,11 +12,12 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.gnss.signals import E5B, GNSS_COUNT, L1, L2, L5, SLOT_COUNT, Gnss
+from eskf_ros.gnss.signals import E5B, GNSS_COUNT, L1, L2, L5, SLOT_COUNT, Gnss, is_beidou_geostationary
 from eskf_ros.gnss.time import (
     BEIDOU_OFFSET,
     SECONDS_PER_DAY,
@@ -144,6 +145,45 @@ _GAMMA_E5B = (L1 / E5B) ** 2
 Fields = Mapping[str, float]
 
 
+class Broadcast(NamedTuple):
+    """A navigation message as it was sent, from which a record is made.
+
+    ``week``, ``seconds``: reference time of the clock (GLONASS: tb in UTC) on the constellation's own time scale, the
+    week counted from 6 January 1980. ``fields``: the other numbers by the names of `kepler_record` or `glonass_record`,
+    in RINEX units; what was not sent is not there. ``leap``: GPS time minus UTC, for GLONASS.
+    """
+
+    gnss: Gnss
+    sv_id: int
+    message: Message
+    week: int
+    seconds: float
+    fields: dict[str, float]
+    leap: int = 0
+
+    def record(self) -> np.void:
+        """Return the ephemeris (EPHEMERIS)."""
+        if self.gnss == Gnss.GLONASS:
+            return glonass_record(self.sv_id, (self.week, self.seconds), self.leap, self.fields)
+        return kepler_record(self.gnss, self.sv_id, self.message, (self.week, self.seconds), self.fields)
+
+
+def usual_message(gnss: Gnss, sv_id: int, source: float = 0.0) -> Message | None:
+    """Return the message that is meant where only the satellite is named, None for a constellation without any.
+
+    ``source``: Galileo's data sources (RINEX 3.04, table A8): bit 9 clock of E5b, bit 8 of E5a; bits 0 and 2 I/NAV, bit
+    1 F/NAV.
+    """
+    if gnss == Gnss.BEIDOU:
+        return Message.D2 if is_beidou_geostationary(gnss, sv_id) else Message.D1
+    if gnss == Gnss.GALILEO:
+        bits = int(source)
+        if bits & 0x200 or (bits & 0x5 and not bits & 0x100):
+            return Message.INAV
+        return Message.FNAV if bits & 0x102 else Message.INAV
+    return {Gnss.GPS: Message.LNAV, Gnss.QZSS: Message.LNAV, Gnss.GLONASS: Message.FDMA}.get(gnss)
+
+
 def kepler_record(gnss: Gnss, sv_id: int, message: Message, toc: Instant, fields: Fields) -> np.void:
     """Return the record (EPHEMERIS) of a message with Kepler elements: all constellations but GLONASS.
 
@@ -155,9 +195,9 @@ def kepler_record(gnss: Gnss, sv_id: int, message: Message, toc: Instant, fields
     """
     record = np.zeros(1, EPHEMERIS)[0]
     offset = BEIDOU_OFFSET if gnss == Gnss.BEIDOU else 0.0
-    toe_own = fields.get("toe", toc[1])
+    toe_own = _seconds(fields.get("toe", toc[1]))
     toe_week = week_near(toe_own, toc) if math.isfinite(toe_own + toc[1]) else 0
-    sent = fields.get("sent", math.nan)
+    sent = _seconds(fields.get("sent", math.nan))
     sent_week = week_near(sent, (toe_week, toe_own)) if math.isfinite(sent + toe_own) else 0
     record["gnss_id"], record["sv_id"], record["message"] = gnss, sv_id, message
     record["issue"] = _integer(fields.get("issue", math.nan), NO_ISSUE)
@@ -190,7 +230,7 @@ def glonass_record(sv_id: int, tb_utc: Instant, leap: int, fields: Fields) -> np
     record["issue"] = int(moscow // 900.0)
     record["toe_week"], record["toe"] = record["toc_week"], record["toc"] = normalized(tb_utc[0], tb_utc[1] + leap)
     record["toe_own"] = tb_utc[1]
-    sent = fields.get("sent", math.nan)
+    sent = _seconds(fields.get("sent", math.nan))
     if 0.0 <= sent < SECONDS_PER_DAY:
         # RINEX 2 counts from midnight; so do the first day of a week and RINEX 3.
         sent += SECONDS_PER_DAY * round((tb_utc[1] - sent) / SECONDS_PER_DAY)
@@ -222,7 +262,7 @@ def group_delays(gnss: Gnss, message: Message, fields: Fields) -> NDArray[np.flo
     - GLONASS: L1; L2 is later by delta tau (ICD 5.1, section 4.4).
     """
     delays = np.full(SLOT_COUNT, math.nan)
-    value = {name: _broadcast(fields, name) for name in _DELAY_FIELDS}
+    value = {name: _broadcast(fields, name) for name in DELAY_FIELDS}
     tgd = value["tgd"]
     if gnss in (Gnss.GPS, Gnss.QZSS):
         delays[:4] = tgd, tgd, _GAMMA_L2 * tgd, _GAMMA_L2 * tgd
@@ -311,7 +351,7 @@ def check(records: NDArray[np.void]) -> NDArray[np.int64]:
     kepler = np.stack([records[name] for name in KEPLER_FIELDS], axis=-1)
     state = np.concatenate([records[name] for name in GLONASS_FIELDS], axis=-1)
     finite &= np.where(glonass, np.isfinite(state).all(axis=-1), np.isfinite(kepler).all(axis=-1))
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         orbit = (
             (np.abs(records["sqrt_a"] - 5800.0) < 1200.0)
             & (np.abs(records["e"] - 0.25) <= 0.25)
@@ -340,7 +380,7 @@ def _sorted_once(records: NDArray[np.void]) -> tuple[NDArray[np.void], int]:
     return records[order[last]], len(records) - int(np.count_nonzero(last))
 
 
-_DELAY_FIELDS = (
+DELAY_FIELDS = (
     "tgd",
     "tgd2",
     "isc_l1ca",
@@ -363,6 +403,11 @@ _DELAY_FIELDS = (
 def _broadcast(fields: Fields, name: str) -> float:
     value = fields.get(name, math.nan)
     return value if abs(value) < _NOT_BROADCAST else math.nan
+
+
+def _seconds(value: float) -> float:
+    """Return seconds of a week, NaN for what is no time within years of it."""
+    return value if abs(value) < 1e8 else math.nan
 
 
 def _integer(value: float, otherwise: int) -> int:

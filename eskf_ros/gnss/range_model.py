@@ -94,6 +94,52 @@ def predict_one(
     prediction,
 ):
     """`predict` for one range; latitude, longitude (rad), altitude (m) and the local axes are those of ``position``."""
+    wavelength = SPEED_OF_LIGHT / observed["carrier_hz"]
+    sight(
+        observed,
+        observed["pseudorange_std"],
+        observed["doppler_std"] * wavelength,
+        position,
+        velocity,
+        latitude,
+        longitude,
+        altitude,
+        local_to_ecef,
+        week,
+        seconds,
+        ionosphere,
+        weighting,
+        prediction,
+    )
+    prediction["pseudorange"] -= SPEED_OF_LIGHT * observed["satellite_clock"]
+    prediction["range_rate"] -= SPEED_OF_LIGHT * observed["satellite_clock_drift"]
+    prediction["code_residual"] = observed["pseudorange"] - prediction["pseudorange"]
+    prediction["doppler_residual"] = -observed["doppler"] * wavelength - prediction["range_rate"]
+
+
+@njit
+def sight(
+    observed,
+    given_code_std,
+    given_doppler_std,
+    position,
+    velocity,
+    latitude,
+    longitude,
+    altitude,
+    local_to_ecef,
+    week,
+    seconds,
+    ionosphere,
+    weighting,
+    prediction,
+):
+    """Write all of a PREDICTION but the residuals, for a satellite without clock errors.
+
+    ``observed``: a RANGE, or a record with its fields ``satellite``, ``satellite_velocity``, ``flags``, ``carrier_hz``,
+    ``gnss_id``, ``sv_id``, ``cn0`` and ``noise_factor``. ``given_code_std`` m, ``given_doppler_std`` m/s: of the
+    receiver, NaN for the model's.
+    """
     satellite, satellite_velocity = observed["satellite"], observed["satellite_velocity"]
     unit, length, rate = line_of_sight(
         (satellite[0], satellite[1], satellite[2]),
@@ -120,16 +166,10 @@ def predict_one(
     unmodelled = 0.0
     if math.isnan(modelled):
         modelled, unmodelled = 0.0, UNMODELLED_IONOSPHERE / max(0.3, math.sin(elevation))
-    prediction["pseudorange"] = (
-        length - SPEED_OF_LIGHT * observed["satellite_clock"] + modelled + prediction["troposphere"]
-    )
-    prediction["range_rate"] = rate - SPEED_OF_LIGHT * observed["satellite_clock_drift"]
-    prediction["code_residual"] = observed["pseudorange"] - prediction["pseudorange"]
-    wavelength = SPEED_OF_LIGHT / observed["carrier_hz"]
-    prediction["doppler_residual"] = -observed["doppler"] * wavelength - prediction["range_rate"]
-
-    prediction["code_std"] = observed["pseudorange_std"]
-    if math.isnan(observed["pseudorange_std"]):
+    prediction["pseudorange"] = length + modelled + prediction["troposphere"]
+    prediction["range_rate"] = rate
+    prediction["code_std"] = given_code_std
+    if math.isnan(given_code_std):
         std = code_std(
             weighting,
             observed["gnss_id"],
@@ -140,6 +180,6 @@ def predict_one(
             observed["noise_factor"],
         )
         prediction["code_std"] = math.sqrt(std * std + unmodelled * unmodelled)
-    prediction["doppler_std"] = observed["doppler_std"] * wavelength
-    if math.isnan(observed["doppler_std"]):
+    prediction["doppler_std"] = given_doppler_std
+    if math.isnan(given_doppler_std):
         prediction["doppler_std"] = doppler_std(weighting, observed["cn0"])

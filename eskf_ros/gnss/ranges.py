@@ -17,12 +17,14 @@ from eskf_ros.compiled import njit
 from eskf_ros.gnss.ephemeris import NO_ISSUE, SATELLITE_KEYS, Ephemerides
 from eskf_ros.gnss.orbits import satellite_state, transmission
 from eskf_ros.gnss.signals import (
+    BEIDOU_3,
     GNSS_COUNT,
     L1,
     SIGNAL_CARRIER_HZ,
     SIGNAL_GNSS,
     SIGNAL_SLOT,
     SIGNALS,
+    SPEED_OF_LIGHT,
     UNKNOWN_SIGNAL,
     Gnss,
     carrier_hz,
@@ -31,7 +33,12 @@ from eskf_ros.gnss.time import SECONDS_PER_WEEK, elapsed
 
 
 class Status(IntEnum):
-    """Why a range is not used (a closed list)."""
+    """Why a range is not used (a closed list).
+
+    ``NOT_LOCATED``: no one has looked yet. ``DUPLICATE``: the satellite and signal came before in the same epoch.
+    ``OTHER_SIGNAL``: another signal of the satellite is used. ``WRONG_TIME``: its time tag is not that of its epoch.
+    ``WRONG_WEEK``: an ephemeris would fit if the week were another. ``TOO_MANY``: beyond the most signals of an epoch.
+    """
 
     USABLE = 0
     UNKNOWN_SIGNAL = 1
@@ -45,12 +52,17 @@ class Status(IntEnum):
     LOW_ELEVATION = 9
     LOW_CN0 = 10
     OUTLIER = 11
+    DUPLICATE = 12
+    OTHER_SIGNAL = 13
+    WRONG_TIME = 14
+    WRONG_WEEK = 15
+    TOO_MANY = 16
 
 
 CODE_VALID = 1
 DOPPLER_VALID = 2
 SATELLITE_KNOWN = 4
-GROUP_DELAY_APPLIED = 8
+CLOCK_APPLIED = 8
 IONOSPHERE_APPLIED = 16
 TROPOSPHERE_APPLIED = 32
 ALREADY_TURNED = 64
@@ -79,7 +91,8 @@ RANGE = np.dtype(
 )
 """One measured signal.
 
-``signal``: index into `signals.SIGNALS`. ``flags``: the bits above, as in the topic. ``issue``: of the ephemeris used.
+``signal``: index into `signals.SIGNALS`. ``flags``: the bits above, as in the topic; those that end in APPLIED speak
+of the pseudorange, `CLOCK_APPLIED` of satellite clock and group delay together. ``issue``: of the ephemeris used.
 ``pseudorange`` m, ``doppler`` Hz (positive when approaching), their standard deviations (NaN: by model), ``cn0`` dB-Hz
 (NaN unknown). ``noise_factor``: what a combination multiplies the receiver's noise and multipath with, 1 for a plain
 range. ``satellite``, ``satellite_velocity``: ECEF at transmission (m, m/s), of reception with `ALREADY_TURNED`.
@@ -108,21 +121,30 @@ _UNHEALTHY = int(Status.UNHEALTHY)
 _NO_GROUP_DELAY = int(Status.NO_GROUP_DELAY)
 _BAD_EPHEMERIS = int(Status.BAD_EPHEMERIS)
 _USABLE = int(Status.USABLE)
+_WRONG_WEEK = int(Status.WRONG_WEEK)
 _GLONASS = int(Gnss.GLONASS)
 _SIGNAL_COUNT = len(SIGNALS)
 
 
-def allocate_ranges(count: int) -> NDArray[np.void]:
-    """Return ``count`` ranges (RANGE) in which nothing is known yet."""
-    ranges = np.zeros(count, RANGE)
+def _blank() -> bytes:
+    """Return the bytes of a range in which nothing is known yet."""
+    row = np.zeros(1, RANGE)
     for name in RANGE.names or ():
         if RANGE[name].base.kind == "f":
-            ranges[name] = math.nan
-    ranges["signal"] = UNKNOWN_SIGNAL
-    ranges["status"] = Status.NOT_LOCATED
-    ranges["issue"] = NO_ISSUE
-    ranges["noise_factor"] = 1.0
-    return ranges
+            row[name] = math.nan
+    row["signal"] = UNKNOWN_SIGNAL
+    row["status"] = Status.NOT_LOCATED
+    row["issue"] = NO_ISSUE
+    row["noise_factor"] = 1.0
+    return row.tobytes()
+
+
+_BLANK = _blank()
+
+
+def allocate_ranges(count: int) -> NDArray[np.void]:
+    """Return ``count`` ranges (RANGE) in which nothing is known yet."""
+    return np.frombuffer(bytearray(_BLANK * count), RANGE)
 
 
 def locate(ranges: NDArray[np.void], week: int, seconds: float, ephemerides: Ephemerides) -> None:
@@ -205,8 +227,20 @@ def locate_one(observed, week, seconds, records, first):
     if not 0.0 < observed["doppler_std"] < math.inf:
         observed["doppler_std"] = math.nan
     if not LOWEST_CARRIER_HZ < observed["carrier_hz"] < HIGHEST_CARRIER_HZ:
-        observed["carrier_hz"] = SIGNAL_CARRIER_HZ[signal] if known_signal else math.nan
+        # The channel of a GLONASS satellite moves the range rate by metres per second: without it no Doppler.
+        observed["carrier_hz"] = SIGNAL_CARRIER_HZ[signal] if known_signal and gnss != _GLONASS else math.nan
+    if observed["flags"] & CLOCK_APPLIED:
+        observed["satellite_clock"] = 0.0
+    if not 0 <= gnss < GNSS_COUNT or gnss == BEIDOU_3:
+        # It is an index into tables of constellations.
+        observed["status"] = _UNKNOWN_SIGNAL
+        return
     if observed["flags"] & SATELLITE_KNOWN:
+        velocity = observed["satellite_velocity"]
+        if math.isnan(velocity[0] + velocity[1] + velocity[2]):
+            observed["flags"] &= ~DOPPLER_VALID
+            for axis in range(3):
+                velocity[axis] = 0.0
         observed["status"] = _USABLE if satellite_is_possible(observed) else _BAD_VALUE
         return
     if not known_signal:
@@ -218,23 +252,30 @@ def locate_one(observed, week, seconds, records, first):
     slot = SIGNAL_SLOT[signal]
     chosen, reason = choose(records, first, gnss, sv_id, slot, week, seconds, NO_ISSUE)
     if chosen < 0:
+        if reason == _STALE and fits_another_week(records, first, gnss, sv_id, week, seconds):
+            reason = _WRONG_WEEK
         observed["status"] = reason
         return
     ephemeris = records[chosen]
-    instant = transmission(ephemeris, week, seconds, pseudorange)
+    if observed["flags"] & CLOCK_APPLIED:
+        instant = seconds - pseudorange / SPEED_OF_LIGHT
+    else:
+        instant = transmission(ephemeris, week, seconds, pseudorange)
     position, velocity, clock, drift = satellite_state(ephemeris, week, instant)
     for axis in range(3):
         observed["satellite"][axis] = position[axis]
         observed["satellite_velocity"][axis] = velocity[axis]
-    observed["satellite_clock"] = clock - ephemeris["group_delay"][slot]
+    if not observed["flags"] & CLOCK_APPLIED:
+        observed["satellite_clock"] = clock - ephemeris["group_delay"][slot]
     observed["satellite_clock_drift"] = drift
     observed["issue"] = ephemeris["issue"]
     if gnss == _GLONASS:
-        observed["carrier_hz"] = carrier_hz(signal, ephemeris["channel"])
+        carrier = carrier_hz(signal, ephemeris["channel"])
+        observed["carrier_hz"] = carrier if LOWEST_CARRIER_HZ < carrier < HIGHEST_CARRIER_HZ else math.nan
     if not satellite_is_possible(observed):
         observed["status"] = _BAD_EPHEMERIS
         return
-    observed["flags"] |= SATELLITE_KNOWN | GROUP_DELAY_APPLIED
+    observed["flags"] |= SATELLITE_KNOWN
     observed["status"] = _USABLE
 
 
@@ -293,3 +334,20 @@ def choose(records, first, gnss_id, sv_id, slot, week, seconds, issue):
     if warned or (records[chosen]["unhealthy"] >> slot) & 1:
         return -1, _UNHEALTHY
     return chosen, _USABLE
+
+
+@njit
+def fits_another_week(records, first, gnss_id, sv_id, week, seconds):
+    """True when an ephemeris of the satellite is in its time at these seconds of another week.
+
+    A receiver that counts weeks by 1024, or starts with those of its firmware; a file that is left over from a day that
+    long ago looks the same for few of its satellites.
+    """
+    key = SATELLITE_KEYS * gnss_id + sv_id
+    for k in range(first[key], first[key + 1]):
+        ephemeris = records[k]
+        since_toe = elapsed(week, seconds, ephemeris["toe_week"], ephemeris["toe"])
+        since_toe -= SECONDS_PER_WEEK * math.floor(since_toe / SECONDS_PER_WEEK + 0.5)
+        if -ephemeris["max_lead"] <= since_toe <= ephemeris["max_age"]:
+            return True
+    return False

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.gnss.ephemeris import EPHEMERIS, Message, glonass_record, kepler_record
+from eskf_ros.gnss.ephemeris import EPHEMERIS, Broadcast, Message, usual_message
 from eskf_ros.gnss.rinex import Complaints, Header, RinexError, calendar, numbers, read_header, read_lines
 from eskf_ros.gnss.signals import LETTERS, Gnss
 from eskf_ros.gnss.time import from_calendar, leap_seconds, week_near
@@ -54,7 +54,6 @@ LAYOUTS: dict[tuple[Gnss, Message], tuple[str | None, ...]] = {
     (Gnss.GLONASS, Message.FDMA): _names("x vx ax health y vy ay channel z vz az - - delta_tau accuracy flags"),
 }
 
-_SINGLE_MESSAGE = {Gnss.GPS: Message.LNAV, Gnss.QZSS: Message.LNAV, Gnss.GLONASS: Message.FDMA}
 _KLOBUCHAR = {"GPS": Gnss.GPS, "QZS": Gnss.QZSS, "BDS": Gnss.BEIDOU}
 _REFUSED_SYSTEMS = {"S": "SBAS", "I": "NavIC"}
 
@@ -70,11 +69,13 @@ UNREADABLE = "unreadable record"
 class Navigation:
     """Content of navigation files.
 
-    ``ephemerides``: EPHEMERIS, in the order of the file, unchecked (`ephemeris.Ephemerides` checks, sorts, removes
-    duplicates). ``klobuchar``: eight parameters (alpha 0 to 3, beta 0 to 3) by constellation, where given.
+    ``broadcasts``: the messages in the order of the file. ``ephemerides``: the records (EPHEMERIS) made of them,
+    unchecked (`ephemeris.Ephemerides` checks, sorts, removes duplicates).
+    ``klobuchar``: eight parameters (alpha 0 to 3, beta 0 to 3) by constellation, where given.
     ``leap_seconds``: of the header, None where absent. ``complaints``: what was left out.
     """
 
+    broadcasts: list[Broadcast]
     ephemerides: NDArray[np.void]
     klobuchar: dict[Gnss, NDArray[np.float64]]
     leap_seconds: int | None
@@ -87,7 +88,12 @@ class _Reading:
 
     complaints: Complaints
     klobuchar: dict[Gnss, list[float]] = field(default_factory=dict)
+    broadcasts: list[Broadcast] = field(default_factory=list)
     records: list[np.void] = field(default_factory=list)
+
+    def add(self, broadcast: Broadcast) -> None:
+        self.records.append(broadcast.record())
+        self.broadcasts.append(broadcast)
 
 
 def read_navigation(path: str | os.PathLike[str]) -> Navigation:
@@ -111,6 +117,7 @@ def read_navigation(path: str | os.PathLike[str]) -> Navigation:
         except ValueError as error:
             reading.complaints.add(index, UNREADABLE, str(error))
     return Navigation(
+        reading.broadcasts,
         np.array(reading.records, EPHEMERIS),
         {gnss: np.array(values) for gnss, values in reading.klobuchar.items()},
         leap,
@@ -200,10 +207,10 @@ def _read_block(header: Header, index: int, kind: str, block: list[str], leap: i
     if gnss == Gnss.GLONASS:
         fields["af0"], fields["af1"], fields["sent"] = clock_values
         known = leap_seconds(year, month, day)
-        reading.records.append(glonass_record(sv_id, toc, max(known, leap or known), fields))
+        reading.add(Broadcast(gnss, sv_id, message, *toc, fields, max(known, leap or known)))
         return
     fields["af0"], fields["af1"], fields["af2"] = clock_values
-    reading.records.append(kepler_record(gnss, sv_id, message, toc, fields))
+    reading.add(Broadcast(gnss, sv_id, message, *toc, fields))
     if "week" in fields and "toe" in fields:
         # Weeks of 10 bits, and of BeiDou or Galileo time, count from elsewhere: BeiDou's from 1356, a rest of 332.
         difference = round(week_near(fields["toe"], toc) - fields["week"]) % 1024
@@ -216,16 +223,8 @@ def _message(gnss: Gnss, sv_id: int, kind: str, orbit: list[float]) -> Message |
     words = kind.split()
     if len(words) >= 4:
         return Message.__members__.get(words[3])
-    if gnss in _SINGLE_MESSAGE:
-        return _SINGLE_MESSAGE[gnss]
-    if gnss == Gnss.BEIDOU:
-        return Message.D2 if sv_id <= 5 or sv_id >= 59 else Message.D1
-    # Data sources (RINEX 3.04, table A8): bit 9 clock of E5b, bit 8 of E5a; bits 0 and 2 I/NAV, bit 1 F/NAV.
     source = orbit[17] if len(orbit) > 17 and math.isfinite(orbit[17]) else 0.0
-    bits = int(source)
-    if bits & 0x200 or (bits & 0x5 and not bits & 0x100):
-        return Message.INAV
-    return Message.FNAV if bits & 0x102 else Message.INAV
+    return usual_message(gnss, sv_id, source)
 
 
 def _read_ionosphere(words: list[str], block: list[str], index: int, reading: _Reading) -> None:

@@ -19,6 +19,8 @@ BEIDOU_OFFSET = 14.0
 """GPS time minus BeiDou time, s (BDS-SIS-ICD-B1I 3.0: BDT started at UTC of 1 January 2006)."""
 
 _FIRST_DAY = datetime.date(1980, 1, 6).toordinal()
+_UNIX_DAY = datetime.date(1970, 1, 1).toordinal()
+_SECOND = 1_000_000_000
 
 # Days on which GPS minus UTC grew by one second, from 0 (IERS Bulletin C).
 _LEAP_DAYS = tuple(
@@ -73,6 +75,11 @@ def leap_seconds(year: int, month: int, day: int) -> int:
     return bisect_right(_LEAP_DAYS, datetime.date(year, month, day).toordinal())
 
 
+def date_of(week: int, seconds: float) -> datetime.date:
+    """Return the date of an instant. Raises ValueError or OverflowError outside of the years 1 to 9999."""
+    return datetime.date.fromordinal(_FIRST_DAY + 7 * week + int(seconds // SECONDS_PER_DAY))
+
+
 def week_near(seconds: float, near: Instant) -> int:
     """Return the week in which ``seconds`` of week are closest to the instant ``near``, at most half a week away.
 
@@ -80,6 +87,25 @@ def week_near(seconds: float, near: Instant) -> int:
     seconds of week with a calendar date nearby are neither.
     """
     return near[0] + round((near[1] - seconds) / SECONDS_PER_WEEK)
+
+
+def from_unix(stamp: int) -> Instant:
+    """Return the GPS time of a stamp in ns of Unix time (UTC without its leap seconds, as computers keep it)."""
+    days = stamp // (86400 * _SECOND) + _UNIX_DAY
+    date = datetime.date.fromordinal(days)
+    since = stamp - (_FIRST_DAY - _UNIX_DAY) * 86400 * _SECOND
+    since += leap_seconds(date.year, date.month, date.day) * _SECOND
+    week, rest = divmod(since, 604800 * _SECOND)
+    return week, rest / _SECOND
+
+
+def to_unix(week: int, seconds: float) -> int:
+    """Return the stamp in ns of Unix time of an instant of GPS time, the inverse of `from_unix`."""
+    since = (_FIRST_DAY - _UNIX_DAY) * 86400 * _SECOND + week * 604800 * _SECOND + round(seconds * _SECOND)
+    # Leap seconds are those of the date in UTC, which may be the day before that of GPS time.
+    late = date_of(week, seconds)
+    date = date_of(week, seconds - leap_seconds(late.year, late.month, late.day))
+    return since - leap_seconds(date.year, date.month, date.day) * _SECOND
 
 
 @njit

@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.bags import message_dtype
+from eskf_ros.bags import cloud_messages, message_dtype
+from eskf_ros.gnss.cloud import write_epoch
+from eskf_ros.gnss.ephemeris_cloud import write_ephemerides
 from eskf_ros.simulate.barometer import BarometerMeasurements
 from eskf_ros.simulate.body_velocity import BodyVelocityMeasurements
 from eskf_ros.simulate.dual_antenna import DualAntennaMeasurements
 from eskf_ros.simulate.frames import Frame
 from eskf_ros.simulate.magnetometer import MagnetometerMeasurements
+from eskf_ros.simulate.range_receiver import RangeMeasurements
 from eskf_ros.simulate.wheel import WheelMeasurements
 
 ABSENT = -1.0
@@ -68,6 +71,22 @@ def body_velocity(measured: BodyVelocityMeasurements, part: slice) -> NDArray[An
     messages["linear_velocity"] = measured.velocity[part]
     messages["twist_covariance"] = np.diag([*measured.variance, ABSENT, ABSENT, ABSENT]).ravel()
     return messages
+
+
+def ranges(measured: RangeMeasurements, part: slice) -> NDArray[Any]:
+    """Return `gnss/ranges` (sensor_msgs/PointCloud2), with satellite states if the receiver gives them."""
+    clouds = [
+        write_epoch(measured.epoch(k), int(measured.week[k]), float(measured.seconds[k]), measured.sensor.satellites)
+        for k in range(len(measured.stamp))[part]
+    ]
+    return cloud_messages(measured.stamp[part], clouds, Frame.GNSS)
+
+
+def ephemerides(measured: RangeMeasurements, part: slice) -> NDArray[Any]:
+    """Return `gnss/ephemerides` (sensor_msgs/PointCloud2): all there are, once."""
+    stamps = measured.ephemerides_stamp[part]
+    cloud = write_ephemerides(measured.broadcasts, measured.klobuchar)
+    return cloud_messages(stamps, [cloud] * len(stamps), Frame.GNSS)
 
 
 def _stamped(type_name: str, stamp: NDArray[np.int64], frame: Frame) -> NDArray[Any]:

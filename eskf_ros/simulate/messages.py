@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros import rotation
-from eskf_ros.bags import message_dtype
+from eskf_ros.bags import POINT_CLOUD, message_dtype
 from eskf_ros.simulate import aid_messages
 from eskf_ros.simulate.frames import Frame
 from eskf_ros.simulate.gnss import GnssMeasurements
+from eskf_ros.simulate.range_receiver import RangeMeasurements
 from eskf_ros.simulate.recording import Recording
 
 Array = NDArray[np.float64]
@@ -59,6 +60,16 @@ def topics_of(recording: Recording) -> list[Topic]:
         measured = getattr(recording, aid)
         if measured:
             topics.append(Topic(name, type_name, measured.arrival, partial(messages, measured)))
+    if recording.ranges:
+        topics += _ranges(recording.ranges)
+    return topics
+
+
+def _ranges(measured: RangeMeasurements) -> list[Topic]:
+    topics = [Topic("gnss/ranges", POINT_CLOUD, measured.arrival, partial(aid_messages.ranges, measured))]
+    if not measured.sensor.satellites:
+        arrival = measured.ephemerides_stamp
+        topics.append(Topic("gnss/ephemerides", POINT_CLOUD, arrival, partial(aid_messages.ephemerides, measured)))
     return topics
 
 

@@ -28,6 +28,8 @@ from eskf_ros.simulate.imu import grade_parameters
 from eskf_ros.simulate.magnetometer import Magnetometer, MagnetometerMeasurements
 from eskf_ros.simulate.map_frame import MapFrame
 from eskf_ros.simulate.motion import Vector
+from eskf_ros.simulate.range_episodes import RANGE_EPISODES
+from eskf_ros.simulate.range_receiver import RangeMeasurements, RangeReceiver
 from eskf_ros.simulate.sampling import Interval, Stamps, check_rate
 from eskf_ros.simulate.wheel import WheelMeasurements, WheelOdometer
 
@@ -40,6 +42,7 @@ AIDS = {
     "magnetometer": Magnetometer,
     "barometer": Barometer,
     "body_velocity": BodyVelocity,
+    "ranges": RangeReceiver,
 }
 """The sensors there may be besides an IMU and a GNSS receiver, by their names in `Options` and in `Recording`."""
 
@@ -55,6 +58,7 @@ EPISODES = {
     "zero_covariance": ZeroCovariance,
     "wheel_slip": WheelSlip,
     "magnetic_disturbance": MagneticDisturbance,
+    **RANGE_EPISODES,
 }
 """The kinds of episodes as the command line names them."""
 
@@ -70,10 +74,11 @@ class Options:
     given without gravity: faults the estimator is told nothing about.
 
     ``lever_arm``, ``gnss_rate``, ``position_std``, ``velocity_std``, ``latency``: the first GNSS receiver, see
-    `eskf_ros.simulate.gnss.GnssReceiver`. The sensors that are None are not there. ``outages``: intervals (first,
+    `eskf_ros.simulate.gnss.GnssReceiver`. The sensors that are None are not there; ``ranges`` are those of the first
+    receiver's antenna. ``outages``: intervals (first,
     last) in seconds from time zero without GNSS; None takes the scenario's. ``episodes``: what else goes wrong, see
-    `eskf_ros.simulate.episodes` and `eskf_ros.simulate.gnss_episodes`. ``start`` and ``stop``: the part of the scenario
-    that is recorded, in seconds from time zero; ``stop`` None is its end.
+    `eskf_ros.simulate.episodes`, `eskf_ros.simulate.gnss_episodes` and `eskf_ros.simulate.range_episodes`. ``start``
+    and ``stop``: the part of the scenario that is recorded, in seconds from time zero; ``stop`` None is its end.
     """
 
     grade: str = "industrial"
@@ -103,6 +108,7 @@ class Options:
     magnetometer: Magnetometer | None = None
     barometer: Barometer | None = None
     body_velocity: BodyVelocity | None = None
+    ranges: RangeReceiver | None = None
     episodes: tuple[Episode, ...] = ()
 
     def __post_init__(self) -> None:
@@ -162,6 +168,7 @@ class Recording(GnssMeasurements):
     magnetometer: MagnetometerMeasurements | None = None
     barometer: BarometerMeasurements | None = None
     body_velocity: BodyVelocityMeasurements | None = None
+    ranges: RangeMeasurements | None = None
 
     def parameters(self) -> dict[str, Any]:
         """Return the estimator's parameters that describe the sensors of this recording, by dotted name."""

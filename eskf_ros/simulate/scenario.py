@@ -72,8 +72,11 @@ def simulate(name: str, seed: int = 0, **options: Any) -> Recording:
     aids = {
         aid: sensor.measure(section, episodes, seed_of(seed, RandomStream[aid.upper()]))
         for aid in AIDS
-        if (sensor := getattr(chosen, aid))
+        if aid != "ranges" and (sensor := getattr(chosen, aid))
     }
+    if chosen.ranges:
+        seeds = seed_of(seed, RandomStream.RANGES)
+        aids["ranges"] = chosen.ranges.measure(section, chosen.lever_arm, episodes, seeds)
     return Recording(
         **vars(chosen.first_gnss.measure_as(1, section, episodes, gnss_streams)),
         **aids,
