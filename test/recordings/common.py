@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from eskf_ros import earth
 from eskf_ros.bags import BagWriter, message_dtype
 from eskf_ros.replay.main import main
+from eskf_ros.simulate.map_frame import MapFrame
 
 Array = NDArray[np.float64]
 
@@ -117,6 +118,23 @@ def ecef_to_geodetic_deg(position_ecef: Array) -> Array:
     return geodetic
 
 
+def differences(fixes: Fixes, reference: Fixes) -> Array:
+    """East, north, up (n, 3) in m of fixes from the reference, interpolated."""
+    place = MapFrame(tuple(reference.geodetic[0].tolist()))
+    position, true = (
+        np.array([place.from_geodetic_deg(*geodetic) for geodetic in part.geodetic.tolist()])
+        for part in (fixes, reference)
+    )
+    return position - np.column_stack([np.interp(fixes.time, reference.time, axis) for axis in true.T])
+
+
+def shifted(fixes: Fixes, shift: Array) -> Fixes:
+    """Fixes moved by `shift` (3,), m east, north, up."""
+    place = MapFrame(tuple(fixes.geodetic[0].tolist()))
+    moved = [place.to_geodetic_deg(place.from_geodetic_deg(*geodetic) + shift) for geodetic in fixes.geodetic.tolist()]
+    return Fixes(fixes.time, np.array(moved), fixes.covariance, fixes.status)
+
+
 def imu(time: Array, specific_force: Array, angular_rate: Array) -> Messages:
     """`imu/data` of stamps (n,) in s, specific force (n, 3) in m/s2 and angular rate (n, 3) in rad/s in IMU axes."""
     messages = np.zeros(len(time), message_dtype(IMU))
@@ -182,9 +200,9 @@ def pose_in_earth(topic: str, time: Array, position_ecef: Array, body_to_ecef: A
     return Messages(topic, ODOMETRY, time, messages)
 
 
-def truth_fix(fixes: Fixes, time_offset: float) -> Messages:
+def truth_fix(fixes: Fixes, time_offset: float, topic: str = "truth") -> Messages:
     """`truth`: positions of the antenna, their stamps moved to the clock of the IMU."""
-    return Messages("truth", FIX, fixes.time + time_offset, _fix_messages(fixes, time_offset))
+    return Messages(topic, FIX, fixes.time + time_offset, _fix_messages(fixes, time_offset))
 
 
 def _fix_messages(fixes: Fixes, added_time: float) -> NDArray[Any]:
