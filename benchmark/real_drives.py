@@ -37,7 +37,7 @@ from conftest import find_data_folder  # noqa: E402
 from recordings import drive_0708, husky, tsukishima, walk  # noqa: E402
 from recordings.common import FIX, IMU, ODOMETRY, Outages, Recording, replayed, results_folder  # noqa: E402
 from recordings.kitti import kitti_recording  # noqa: E402
-from recordings.nagoya import nagoya_recording  # noqa: E402
+from recordings.nagoya import nagoya_ranges_recording, nagoya_recording  # noqa: E402
 from recordings.thor75 import thor75_recording  # noqa: E402
 
 Array = NDArray[np.float64]
@@ -49,6 +49,7 @@ AXES = ("horizontal", "vertical")
 STATISTICS = ("rms", "p50", "p95", "max")
 HEADINGS = ("input", "horizontal, m", "vertical, m", "NIS", "NEES", "outside the gate", "restarts")
 PEER_HEADINGS = ("input", "horizontal, m", "vertical, m", "speed, m/s", "heading, deg", "NIS", "restarts")
+EAST_NORTH_HEADINGS = ("input", "east, north 95 %, m", *HEADINGS[1:])
 COURSE_HEADINGS = ("input", "heading known", "heading off the course, deg", "NIS", "restarts", "state at the end")
 NAGOYA_HEADINGS = ("IMU, input", *HEADINGS[1:3], "heading, deg", "NIS", "NEES position; attitude", *HEADINGS[5:])
 OUTAGE_HEADINGS = ("input", "outages", "horizontal, m", "vertical, m", "inside the 95 % ellipse", "restarts")
@@ -72,6 +73,12 @@ TSUKISHIMA = (
     Variant("position only, default noise", ("gnss.use_velocity: false",), chosen_noise=False),
     Variant("with velocity"),
     Variant("with velocity, default noise", chosen_noise=False),
+)
+CORRELATED = "gnss.correlation_time: 30.0"
+RANGES = (
+    Variant("loose, position only", ("gnss.use_velocity: false",)),
+    Variant("loose, with velocity"),
+    Variant("loose, with velocity, correlated errors", (CORRELATED,)),
 )
 HUSKY = (
     Variant("default noise", chosen_noise=False),
@@ -168,9 +175,16 @@ def tsukishima_figures(folder: Path) -> str:
         rows.append(variant_row(recording, variant))
         replays = [replay_with_outages(recording, variant, outages) for outages in tsukishima.OUTAGE_SETS]
         outage_rows.append(outage_row(variant.label, replays))
+    with_ranges = tsukishima.tsukishima_ranges_recording(folder, find_data_folder("tsukishima_20201105"))
+    window = [
+        east_north_row(f"{variant.label}{label}", replay_with_outages(with_ranges, variant, (), truth))
+        for truth, label in (("truth", ""), ("truth_shifted", ", constant removed"))
+        for variant in RANGES
+    ]
     return (
         f"Between fixes one second apart:\n\n{table(HEADINGS, rows)}\n"
-        f"At the end of outages of {tsukishima.OUTAGE_LENGTH:g} s:\n\n{table(OUTAGE_HEADINGS, outage_rows)}"
+        f"At the end of outages of {tsukishima.OUTAGE_LENGTH:g} s:\n\n{table(OUTAGE_HEADINGS, outage_rows)}\n"
+        f"The 850 s with raw measurements, on our own point solutions:\n\n{table(EAST_NORTH_HEADINGS, window)}"
     )
 
 
@@ -215,21 +229,34 @@ def walk_figures(folder: Path) -> str:
             outage_row(v.label, [replay_with_outages(recording, v, outages) for outages in outage_sets]) for v in INPUTS
         ]
         text += f"\nAt the end of outages of {length:g} s:\n\n{table(OUTAGE_HEADINGS, rows)}"
-    return text
+    with_ranges = walk.walk_ranges_recording(folder, find_data_folder("walk_0827"))
+    rows = [variant_row(with_ranges, variant) for variant in RANGES]
+    return f"{text}\nOn our own point solutions, four times a second:\n\n{table(HEADINGS, rows)}"
 
 
 def nagoya_figures(folder: Path) -> str:
     """Errors against the true trajectory, by grade of the simulated IMU."""
-    rows = []
+    source = find_data_folder("nagoya_20240720")
+    rows, simulated = [], []
     for grade in NAGOYA_GRADES:
-        recording = nagoya_recording(folder, find_data_folder("nagoya_20240720"), grade)
-        for variant in INPUTS:
-            summary = replayed(recording, *variant.lines)
-            nis, outside = aid_cells(summary)
-            errors = [numbers(summary["error"][key], STATISTICS) for key in (*AXES, "heading_deg")]
-            nees = "; ".join(consistency(summary["nees"][key]) for key in ("position", "attitude"))
-            rows.append([f"{grade}, {variant.label}", *errors, nis, nees, outside, str(summary["restarts"])])
-    return table(NAGOYA_HEADINGS, rows)
+        recording = nagoya_recording(folder, source, grade)
+        rows += [nagoya_row(f"{grade}, {variant.label}", recording, variant) for variant in INPUTS]
+    for grade in NAGOYA_GRADES[:2]:
+        recording = nagoya_ranges_recording(folder, source, grade)
+        simulated += [nagoya_row(f"{grade}, {variant.label}", recording, variant) for variant in RANGES]
+    return (
+        f"On the real fixes of the receiver:\n\n{table(NAGOYA_HEADINGS, rows)}\n"
+        f"On our own point solutions of simulated ranges:\n\n{table(NAGOYA_HEADINGS, simulated)}"
+    )
+
+
+def nagoya_row(label: str, recording: Recording, variant: Variant) -> list[str]:
+    """Errors of position and heading, and consistency of position and attitude."""
+    summary = replayed(recording, *variant.lines)
+    nis, outside = aid_cells(summary)
+    errors = [numbers(summary["error"][key], STATISTICS) for key in (*AXES, "heading_deg")]
+    nees = "; ".join(consistency(summary["nees"][key]) for key in ("position", "attitude"))
+    return [label, *errors, nis, nees, outside, str(summary["restarts"])]
 
 
 DRIVES: dict[str, Callable[[Path], str]] = {
@@ -253,6 +280,13 @@ def error_row(label: str, summary: dict[str, Any]) -> list[str]:
     nis, outside = aid_cells(summary)
     errors = [numbers(summary["error"][axis], STATISTICS) for axis in AXES]
     return [label, *errors, nis, consistency(summary["nees"]["position"]), outside, str(summary["restarts"])]
+
+
+def east_north_row(label: str, replay: Replay) -> list[str]:
+    """Errors of a replay, those of east and north apart too."""
+    east_north = np.percentile(np.abs(replay.error), 95.0, axis=0).tolist()
+    label, *cells = error_row(label, replay.summary)
+    return [label, cell(east_north), *cells]
 
 
 def aid_cells(summary: dict[str, Any]) -> tuple[str, str]:
@@ -307,11 +341,11 @@ def between_markers(text: str, name: str, content: str) -> str:
     return f"{before}{begin}\n{content}\n{end}{after}"
 
 
-def replay_with_outages(recording: Recording, variant: Variant, outages: Outages) -> Replay:
+def replay_with_outages(recording: Recording, variant: Variant, outages: Outages, truth_topic: str = "truth") -> Replay:
     """Replay with outages and read back the published odometry."""
-    summary = replayed(recording, *variant.lines, outages=outages, chosen_noise=variant.chosen_noise)
+    summary = replayed(recording, *variant.lines, outages=outages, chosen_noise=variant.chosen_noise, truth=truth_topic)
     estimate = read(results_folder(recording.bag) / "odometry.mcap", ODOMETRY_TOPIC, ODOMETRY)
-    truth = read(recording.bag, "/truth", FIX)
+    truth = read(recording.bag, f"/{truth_topic}", FIX)
     first = int(read(recording.bag, "/imu/data", IMU)["stamp"][0])
     truth = truth[(truth["stamp"] >= estimate["stamp"][0]) & (truth["stamp"] <= estimate["stamp"][-1])]
 

@@ -12,6 +12,9 @@ once a second, with the covariances of RTKLIB.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,32 +22,46 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
+from eskf_ros.gnss.ephemeris import Ephemerides
+from eskf_ros.gnss.signals import Gnss
+from eskf_ros.simulate.episodes import Episode
 from eskf_ros.simulate.imu import SensorErrors, grade_parameters, ideal_samples
 from eskf_ros.simulate.map_frame import MapFrame
 from eskf_ros.simulate.motion import Motion, checked_times
-from eskf_ros.simulate.sampling import RandomStream, seed_of
+from eskf_ros.simulate.range_episodes import StreetCanyon
+from eskf_ros.simulate.range_receiver import RangeReceiver
+from eskf_ros.simulate.sampling import START_STAMP, RandomStream, Section, Stamps, seed_of
 from recordings.common import (
     GNSS_LATENCY,
     STATUS_FIX,
     Array,
     Fixes,
+    Messages,
     Recording,
     gnss_fix,
     gnss_velocity,
     gps_to_unix,
     imu,
+    nanoseconds,
     pose_in_earth,
     read_rtklib,
     write_bag,
 )
+from recordings.satellites import RangeEpochs, gnss_ephemerides, gnss_ranges, solved_fixes
 
 WEEK = 2323
+LEAP_SECONDS = 18
 IMU_RATE = 100.0
+
+RANGE_RATE = 5.0
+LEVER_ARM = (0.4, -0.2, 1.3)
+STREETS = (StreetCanyon(0.0, math.inf, height=12.0, width=25.0),)
 
 INSTALLATION = """\
 /**:
   ros__parameters:
 """
+RANGES_INSTALLATION = f"{INSTALLATION}    gnss.lever_arm: {list(LEVER_ARM)}\n"
 
 
 class RecordedTrajectory:
@@ -97,10 +114,73 @@ def euler_rate_matrices(angles: Array, rates: Array) -> tuple[Array, Array]:
     return np.moveaxis(np.array(matrices), -1, 0), np.moveaxis(np.array(derivatives), -1, 0)
 
 
+@dataclass(frozen=True)
+class RecordedSection(Section):
+    """A drive that begins at ``start_stamp`` (ns of Unix time) instead of the time zero of all scenarios."""
+
+    start_stamp: int = START_STAMP
+
+    def stamps(self, rate: float, phase: float) -> Stamps:
+        """Return the stamps of a sensor that measures ``phase`` seconds after the start, then at ``rate`` Hz."""
+        return super().stamps(rate, phase) - START_STAMP + self.start_stamp
+
+    def elapsed(self, stamps: Stamps) -> Array:
+        """Return seconds from the start."""
+        return super().elapsed(stamps - self.start_stamp + START_STAMP)
+
+
 def nagoya_recording(folder: Path, source: Path, grade: str = "consumer", seed: int = 1) -> Recording:
-    """Write the drive (the folder `source`) to `folder`, with an IMU of `grade` and truth at 5 Hz."""
-    start, trajectory, frame = read_trajectory(source)
-    noise = grade_parameters(grade)
+    """Write the drive (the folder `source`) to `folder`, with an IMU of `grade`, the real fixes, and truth at 5 Hz."""
+    solution_time, solution = read_rtklib(source / "rover_1Hz_spp.pos")
+    solution_time -= LEAP_SECONDS
+    status = np.full(len(solution), STATUS_FIX, np.int8)
+    fixes = Fixes(solution_time, solution[:, :3], enu_covariance(solution[:, 5:11]), status)
+    velocity_std = np.sqrt(np.diagonal(enu_covariance(solution[:, 16:22]), axis1=1, axis2=2))
+    bag = folder / f"nagoya_{grade}.mcap"
+    write_bag(
+        bag,
+        *imu_and_truth(read_section(source), grade, seed),
+        gnss_fix(fixes, 0.0),
+        gnss_velocity(solution_time, solution[:, [14, 13, 15]], velocity_std, solution_time + GNSS_LATENCY),
+    )
+    return Recording(bag, INSTALLATION, noise_lines(grade))
+
+
+def nagoya_ranges_recording(
+    folder: Path,
+    source: Path,
+    grade: str = "consumer",
+    seed: int = 1,
+    episodes: Sequence[Episode] = STREETS,
+) -> Recording:
+    """Write the drive with simulated ranges to the real satellites of that day, and our own point solutions of them."""
+    section = read_section(source)
+    receiver = RangeReceiver(rate=RANGE_RATE, systems="GEC", nav=str(source / "base.nav"))
+    measured = receiver.measure(section, LEVER_ARM, episodes, seed_of(seed, RandomStream.RANGES))
+    counts = range(len(measured.stamp))
+    epochs = RangeEpochs(measured.stamp * 1e-9, WEEK, measured.seconds, [measured.epoch(k) for k in counts])
+    ephemerides = Ephemerides(np.array([broadcast.record() for broadcast in measured.broadcasts]))
+    fixes, velocity_time, velocity, velocity_std = solved_fixes(epochs, ephemerides, measured.klobuchar[Gnss.GPS])
+    bag = folder / f"nagoya_ranges_{grade}.mcap"
+    write_bag(
+        bag,
+        *imu_and_truth(section, grade, seed),
+        gnss_fix(fixes, 0.0),
+        gnss_velocity(velocity_time, velocity, velocity_std, velocity_time + GNSS_LATENCY),
+        gnss_ranges(epochs, measured.arrival * 1e-9),
+        gnss_ephemerides(section.start_stamp * 1e-9, measured.broadcasts, measured.klobuchar),
+    )
+    return Recording(bag, RANGES_INSTALLATION, noise_lines(grade))
+
+
+def noise_lines(grade: str) -> str:
+    """Lines of a parameter file that say how good the IMU is."""
+    return "".join(f"    {name}: {value}\n" for name, value in grade_parameters(grade).items())
+
+
+def imu_and_truth(section: RecordedSection, grade: str, seed: int) -> tuple[Messages, Messages]:
+    """`imu/data` of an IMU of `grade`, and `truth`."""
+    noise, trajectory, frame, start = grade_parameters(grade), section.path, section.frame, section.start_stamp * 1e-9
     times = np.arange(1, int(trajectory.duration * IMU_RATE) + 1) / IMU_RATE
     specific_force, angular_rate = ideal_samples(trajectory, frame, times)
     gyro, accelerometer = (
@@ -109,31 +189,14 @@ def nagoya_recording(folder: Path, source: Path, grade: str = "consumer", seed: 
     )
     angular_rate, _ = gyro.apply(angular_rate, IMU_RATE, seed_of(seed, RandomStream.GYRO))
     specific_force, _ = accelerometer.apply(specific_force, IMU_RATE, seed_of(seed, RandomStream.ACCELEROMETER))
-
-    solution_time, solution = read_rtklib(source / "rover_1Hz_spp.pos")
-    fixes = Fixes(
-        solution_time,
-        solution[:, :3],
-        enu_covariance(solution[:, 5:11]),
-        np.full(len(solution), STATUS_FIX, np.int8),
-    )
-    velocity_std = np.sqrt(np.diagonal(enu_covariance(solution[:, 16:22]), axis1=1, axis2=2))
     truth = trajectory.motion(trajectory.breakpoints)
-    bag = folder / f"nagoya_{grade}.mcap"
-    write_bag(
-        bag,
-        imu(start + times, specific_force, angular_rate),
-        gnss_fix(fixes, 0.0),
-        gnss_velocity(solution_time, solution[:, [14, 13, 15]], velocity_std, solution_time + GNSS_LATENCY),
-        pose_in_earth(
-            "truth",
-            start + trajectory.breakpoints,
-            frame.to_ecef(truth.position_map),
-            frame.rotation_map_to_ecef @ truth.rotation_body_to_map,
-            np.linalg.norm(truth.velocity_map, axis=1),
-        ),
+    return imu(start + times, specific_force, angular_rate), pose_in_earth(
+        "truth",
+        start + trajectory.breakpoints,
+        frame.to_ecef(truth.position_map),
+        frame.rotation_map_to_ecef @ truth.rotation_body_to_map,
+        np.linalg.norm(truth.velocity_map, axis=1),
     )
-    return Recording(bag, INSTALLATION, "".join(f"    {name}: {value}\n" for name, value in noise.items()))
 
 
 def enu_covariance(std: Array) -> Array:
@@ -142,13 +205,14 @@ def enu_covariance(std: Array) -> Array:
     return squares[:, [1, 3, 4, 3, 0, 5, 4, 5, 2]].reshape(-1, 3, 3)
 
 
-def read_trajectory(source: Path) -> tuple[float, RecordedTrajectory, MapFrame]:
-    """Unix time (GPS time, no leap seconds) of the start, the trajectory, and the map frame it is in."""
+def read_section(source: Path) -> RecordedSection:
+    """The whole drive."""
     table = np.loadtxt(source / "reference.csv", delimiter=",", skiprows=1)
     frame = MapFrame((float(table[0, 2]), float(table[0, 3]), float(table[0, 4])))
     position_map = (table[:, 5:8] - frame.origin_ecef) @ frame.rotation_map_to_ecef
     # Heading is clockwise from north, pitch is positive nose up. The map is level within 0.02 deg all along the drive.
     roll, pitch, heading = np.radians(table[:, 8:11]).T
     angles = np.column_stack([roll, -pitch, 0.5 * np.pi - heading])
-    times = table[:, 0] - table[0, 0]
-    return float(gps_to_unix(WEEK, table[0, 0], 0)), RecordedTrajectory(times, position_map, angles), frame
+    trajectory = RecordedTrajectory(table[:, 0] - table[0, 0], position_map, angles)
+    start = int(nanoseconds(gps_to_unix(WEEK, table[:1, 0], LEAP_SECONDS))[0])
+    return RecordedSection(trajectory, frame, 0.0, trajectory.duration, start)
