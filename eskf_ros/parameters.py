@@ -107,6 +107,21 @@ class Topics:
         "geometry_msgs/TwistWithCovarianceStamped: velocity of the GNSS antenna, East-North-Up.",
         **_TOPIC,
     )
+    heading: str = _parameter(
+        "gnss/heading", "", "sensor_msgs/Imu: yaw of a dual-antenna receiver, with its covariance.", **_TOPIC
+    )
+    mag: str = _parameter("imu/mag", "", "sensor_msgs/MagneticField: magnetometer in the frame of the IMU.", **_TOPIC)
+    wheel: str = _parameter(
+        "wheel/odom", "", "nav_msgs/Odometry: wheel odometry, of which speed and yaw rate are used.", **_TOPIC
+    )
+    body_velocity: str = _parameter(
+        "body_velocity",
+        "",
+        "geometry_msgs/TwistWithCovarianceStamped: velocity in the axes of the vehicle, of a DVL, optical flow, radar "
+        "or odometry of any kind; an axis with a negative variance is absent.",
+        **_TOPIC,
+    )
+    baro: str = _parameter("baro", "", "sensor_msgs/FluidPressure: air pressure.", **_TOPIC)
 
 
 @dataclass(frozen=True)
@@ -329,6 +344,133 @@ class SecondGnss:
 
 
 @dataclass(frozen=True)
+class Aid:
+    """What every aid has: the fields of its group begin with these."""
+
+    use: bool = _parameter(True, "", "Fuse the messages of this topic.", live=True)
+    time_offset: float = _parameter(
+        0.0, "s", "Added to the stamps: true time = stamp + offset.", minimum=-10.0, maximum=10.0
+    )
+    covariance_scale: float = _parameter(
+        1.0,
+        "",
+        "Factor on the covariances (variances) that the messages carry; the floors apply after it.",
+        above=0.0,
+        maximum=1.0e6,
+        live=True,
+    )
+    gate_probability: float = _parameter(
+        0.999, "", "Chi-square gate: the share of good measurements that passes.", above=0.0, below=1.0, live=True
+    )
+
+
+@dataclass(frozen=True)
+class Heading(Aid):
+    std_floor_deg: float = _parameter(
+        0.2, "deg", "The standard deviation is never taken smaller than this.", above=0.0, maximum=90.0, live=True
+    )
+    unknown_std_deg: float = _parameter(
+        1.0, "deg", "Standard deviation where the message gives none.", above=0.0, maximum=90.0, live=True
+    )
+
+
+@dataclass(frozen=True)
+class Mag(Aid):
+    use: bool = _parameter(
+        False,
+        "",
+        "Fuse the heading that the magnetometer shows. Off unless asked for: in vehicles, indoors and near iron it "
+        "misleads.",
+        live=True,
+    )
+    std_floor: float = _parameter(
+        1.0e-6,
+        "T",
+        "The standard deviation per axis is never taken smaller than this.",
+        above=0.0,
+        maximum=1.0,
+        live=True,
+    )
+    unknown_std: float = _parameter(
+        1.0e-6, "T", "Standard deviation per axis where the message gives none.", above=0.0, maximum=1.0, live=True
+    )
+
+
+@dataclass(frozen=True)
+class Wheel(Aid):
+    speed_std_floor: float = _parameter(
+        0.05,
+        "m/s",
+        "The standard deviation of the speed is never taken smaller than this.",
+        above=0.0,
+        maximum=100.0,
+        live=True,
+    )
+    yaw_rate_std_floor: float = _parameter(
+        0.02,
+        "rad/s",
+        "The standard deviation of the yaw rate is never taken smaller than this.",
+        above=0.0,
+        maximum=10.0,
+        live=True,
+    )
+    unknown_speed_std: float = _parameter(
+        0.1, "m/s", "Standard deviation of the speed where the message gives none.", above=0.0, maximum=100.0, live=True
+    )
+    unknown_yaw_rate_std: float = _parameter(
+        0.1,
+        "rad/s",
+        "Standard deviation of the yaw rate where the message gives none.",
+        above=0.0,
+        maximum=10.0,
+        live=True,
+    )
+
+
+@dataclass(frozen=True)
+class BodyVelocity(Aid):
+    std_floor: float = _parameter(
+        0.02,
+        "m/s",
+        "The standard deviation per axis is never taken smaller than this.",
+        above=0.0,
+        maximum=100.0,
+        live=True,
+    )
+    unknown_std: float = _parameter(
+        0.2, "m/s", "Standard deviation per axis where the message gives none.", above=0.0, maximum=100.0, live=True
+    )
+
+
+@dataclass(frozen=True)
+class Baro(Aid):
+    std_floor: float = _parameter(
+        3.0, "Pa", "The standard deviation is never taken smaller than this.", above=0.0, maximum=1.0e4, live=True
+    )
+    unknown_std: float = _parameter(
+        10.0, "Pa", "Standard deviation where the message gives none.", above=0.0, maximum=1.0e4, live=True
+    )
+
+
+@dataclass(frozen=True)
+class Zupt:
+    enabled: bool = _parameter(
+        False, "", "While the vehicle stands still, hold velocity and turn rate at zero.", live=True
+    )
+
+
+@dataclass(frozen=True)
+class Nhc:
+    enabled: bool = _parameter(
+        False,
+        "",
+        "For vehicles on wheels: they move neither sideways nor up and down at the rear axle (non-holonomic "
+        "constraint).",
+        live=True,
+    )
+
+
+@dataclass(frozen=True)
 class History:
     window: float = _parameter(
         2.0,
@@ -496,6 +638,13 @@ class Parameters:
     second_gnss: SecondGnss = _group(
         SecondGnss, "A second GNSS receiver with an antenna of its own; all else is as for the first."
     )
+    heading: Heading = _group(Heading, "Heading of a dual-antenna receiver.")
+    mag: Mag = _group(Mag, "Magnetometer.")
+    wheel: Wheel = _group(Wheel, "Wheel odometry.")
+    body_velocity: BodyVelocity = _group(BodyVelocity, "Velocity in the axes of the vehicle.")
+    baro: Baro = _group(Baro, "Barometer.")
+    zupt: Zupt = _group(Zupt, "Standing still.")
+    nhc: Nhc = _group(Nhc, "Non-holonomic constraint.")
     history: History = _group(History, "Late and out-of-order messages.")
     alignment: Alignment = _group(Alignment, "Start-up: levelling, heading, and when the estimate is called good.")
     warm_start: WarmStart = _group(WarmStart, "What the node remembers of its last run.")

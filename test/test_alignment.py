@@ -423,6 +423,29 @@ def test_shaking_is_no_rest_and_a_long_drive_levels_all_the_same() -> None:
     np.testing.assert_allclose(np.diag(core(state))[12:], settings["gyro_bias_std"] ** 2, rtol=1e-12)
 
 
+@pytest.mark.parametrize("turn", [math.radians(0.5), math.radians(2.0)])
+def test_a_creeping_turn_after_a_rest_is_no_rest(turn: float) -> None:
+    """It is quiet, level, and no fix proves the motion: only that no bias changes by as much tells."""
+    settings = make_settings(alignment__static_duration=2.0)
+    state = waiting()
+    bias = np.array([0.01, 0.02, -0.01])
+    force, rate = at_rest(state, Rotation.identity(), np.zeros(3), bias)
+    watch(state, settings, 10.5, force, rate)
+    known = state["gyro_bias"].copy()
+    watch(state, settings, 10.0, force, rate + np.array([0.0, 0.0, turn]))
+    np.testing.assert_array_equal(state["gyro_bias"], known)
+
+
+def test_a_bias_that_warms_up_is_followed_at_rest() -> None:
+    settings = make_settings(alignment__static_duration=2.0)
+    state = waiting()
+    bias = np.array([0.01, 0.02, -0.01])
+    force, rate = at_rest(state, Rotation.identity(), np.zeros(3), bias)
+    for second in range(60):
+        watch(state, settings, 1.0, force, rate + np.radians(0.1) * second / 60.0)
+    assert state["stamp"] - state["still_stamp"] < 3_000_000_000
+
+
 def test_restart_while_standing_still_counts_from_zero() -> None:
     """The IMU falls silent on a parked robot: afterwards the gyro bias is what it was before, not several times it."""
     settings = make_settings(alignment__static_duration=2.0)
@@ -471,7 +494,7 @@ def distrusting(robots: int, std: float, speed: float = 0.0) -> int:
             latitude = math.radians(DATUM[0]) + (north + speed * seconds) / 6.378e6
             longitude = math.radians(DATUM[1]) + east / (6.378e6 * math.cos(latitude))
             aid["stamp"] = round(seconds * 1e9)
-            aid["payload"] = (latitude, longitude, DATUM[2] + up, std**2, 0.0, 0.0, std**2, 0.0, std**2)
+            aid["payload"][:9] = (latitude, longitude, DATUM[2] + up, std**2, 0.0, 0.0, std**2, 0.0, std**2)
             alignment.note_position(state, aid, settings)
             if state["motion_stamp"] > 0 and state["still_stamp"] == NEVER:
                 found += 1

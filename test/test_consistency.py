@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from kernels import core
 
-from eskf_ros.filter import layout, navigator, strapdown, update
+from eskf_ros.filter import layout, navigator, settings, strapdown, update
 from eskf_ros.filter.layout import ACCEL_BIAS, GYRO_BIAS
 from eskf_ros.parameters import from_mapping
 from eskf_ros.rotation import to_matrix
@@ -157,7 +157,7 @@ class FrozenGain:
     def __init__(self, recording: Recording, state: Any, parameters: Any) -> None:
         self.recording = recording
         self.state = state
-        self.settings = navigator.settings_from(parameters)[0]
+        self.settings = settings.settings_from(parameters)[0]
         self.work = layout.allocate(layout.WORK)[0]
         self.sample = layout.allocate(layout.IMU)[0]
         self.next_imu = int(np.searchsorted(recording.imu_stamp, state["imu_stamp"])) + 1
@@ -197,7 +197,7 @@ class FrozenGain:
         ):
             aid = layout.allocate(layout.AID)[0]
             aid["stream"] = stream
-            aid["payload"] = np.concatenate([values, covariance[six]])
+            aid["payload"][:9] = np.concatenate([values, covariance[six]])
             navigator.linearize(self.state, aid, self.settings, self.work)
             body_to_map = np.array(to_matrix(tuple(self.state["attitude"])))
             if stream not in self.gains:

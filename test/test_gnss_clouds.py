@@ -441,3 +441,9 @@ def test_no_ephemeris_is_fatal(values: dict[str, float]) -> None:
     for name, value in values.items():
         found[name] = value
     Ephemerides(read_ephemerides(found).records)
+
+
+def test_the_manual_names_every_field() -> None:
+    manual = (Path(__file__).resolve().parent.parent / "docs" / "ranges.md").read_text("utf-8")
+    names = {*(cloud.SATELLITE_POINT.names or ()), *PARAMETERS, "toc_week", "toc", "message", "leap_seconds"}
+    assert not {name for name in names if f"`{name}`" not in manual}

@@ -359,9 +359,15 @@ def test_a_real_sky_may_be_given(tmp_path: Path) -> None:
     measured = ranges_of(recorded(nav=str(path)))
     assert set(np.unique(measured.ranges["gnss_id"])) == {Gnss.GPS}
     assert measured.system_offset[Gnss.GPS] == 0.0
-    path.write_text(path.read_text("ascii").replace("2025 06 01", "2024 06 01"), encoding="ascii")
+    path.write_text(path.read_text("ascii").replace("2025 06 01", "2024 06 02"), encoding="ascii")
     with pytest.raises(ValueError, match="no ephemeris of GEC for the time of the scenario, GPS week 2369"):
         recorded(nav=str(path), rate=4.0)
+    # A year before, on a recording whose clock is as much ahead.
+    before = ranges_of(recorded(nav=str(path), clock_offset=364.0 * 86400.0))
+    assert set(before.week) == {2317}
+    np.testing.assert_array_equal(before.stamp, measured.stamp)
+    found = measured_epoch(before.epoch(0), int(before.week[0]), float(before.seconds[0]), store(before))
+    assert np.isin(found["status"], (Status.USABLE, Status.LOW_CN0)).all()
 
 
 @pytest.mark.parametrize(
@@ -369,6 +375,7 @@ def test_a_real_sky_may_be_given(tmp_path: Path) -> None:
     [
         (["--sensor", "ranges:systems=GX"], "systems are letters out of GECJR, not 'GX'"),
         (["--sensor", "ranges:rate=0"], "rate of the ranges must be a positive number"),
+        (["--sensor", "ranges:rate=0.1", "--set", "start=4"], "at 0.1 Hz there is no epoch of ranges from 4 s to 5 s"),
         (["--sensor", "ranges:nav=nowhere.nav"], "nowhere.nav: No such file"),
         (["--episode", "satellites:start=1,length=2,keep=-1"], "the number of satellites to keep is not negative"),
         (["--episode", "satellites:start=1,length=2,choice=best"], "unknown choice of satellites 'best'"),

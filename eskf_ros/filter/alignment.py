@@ -68,6 +68,9 @@ Fixes are differenced, and over fractions of a second: at three sigma the noise 
 REST_TOLERANCE = 0.2
 """Change of the mean specific force across the vertical (m/s2) that a robot at rest may show: settling springs."""
 
+REST_RATE_SIGMAS = 4.0
+"""The mean rate at rest is the bias within this many sigma."""
+
 STRONGEST_START = 5.0
 """No robot gathers speed faster (m/s2)."""
 
@@ -217,7 +220,7 @@ def watch_stillness(state, settings):
     duration = (state.stamp - state.window_start) * 1e-9
     if duration < settings.static_duration or state.window_count < MINIMUM_WINDOW_SAMPLES:
         return
-    still = is_still(state, settings) and state.motion_stamp < state.window_start and is_same_rest(state)
+    still = is_still(state, settings) and state.motion_stamp < state.window_start and is_same_rest(state, settings)
     watch_input(state, still, settings)
     if state.position_known == 1 and state.last_fix_stamp < state.window_start:
         # Without a fix since it began nobody knows whether a slow acceleration passes for a tilt.
@@ -311,14 +314,23 @@ def is_still(state, settings):
 
 
 @njit
-def is_same_rest(state):
-    """Say whether gravity is still where the last still window left it, as far as the gyros tell.
+def is_same_rest(state, settings):
+    """Say whether rate and gravity are still where the last still window left them.
 
-    A steady acceleration looks like a tilt, but one that no gyro has seen.
+    A creeping turn is as quiet as rest, but its rate is none that the bias can have come to since. A steady
+    acceleration looks like a tilt, but one that no gyro has seen.
     """
     if state.level_known == 0 or state.still_stamp == NEVER:
         return True
     n = state.window_count
+    earth = rotate_back(to_matrix(state.attitude), state.earth_rate_map)
+    noise = settings.gyro_noise_density**2 / ((state.stamp - state.window_start) * 1e-9)
+    walked = settings.gyro_bias_random_walk**2 * (state.stamp - state.still_stamp) * 1e-9
+    for i in range(3):
+        excess = state.window_sum[3 + i] / n - state.gyro_bias[i] - earth[i]
+        variance = state.covariance[GYRO_BIAS + i, GYRO_BIAS + i] + noise + walked
+        if excess * excess > REST_RATE_SIGMAS**2 * variance:
+            return False
     force = (state.window_sum[0] / n, state.window_sum[1] / n, state.window_sum[2] / n)
     force_map = rotate(to_matrix(state.attitude), force)
     sideways = cross(local_up(state), force_map)

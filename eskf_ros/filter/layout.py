@@ -61,7 +61,10 @@ class Status(IntEnum):
 
 
 class Verdict(IntEnum):
-    """What became of an offered measurement (a closed list; files show the names in lower case)."""
+    """What became of an offered measurement (a closed list; files show the names in lower case).
+
+    INACTIVE is for constraints that do not hold at the moment, such as rest while the robot moves: it leaves no record.
+    """
 
     WAITING = 0
     FUSED = 1
@@ -76,17 +79,36 @@ class Verdict(IntEnum):
     OUTSIDE_HISTORY = 10
     DISABLED = 11
     WEIGHED_DOWN = 12
+    INACTIVE = 13
 
 
 class Stream(IntEnum):
-    """Streams by rank: of several messages with one stamp the lower rank comes first."""
+    """Streams by rank: of several messages with one stamp the lower rank comes first.
+
+    From ZUPT on they are constraints: no sensor sends them, the timeline puts them on a grid of stamps.
+    """
 
     IMU = 0
     GNSS_POSITION = 1
     GNSS_VELOCITY = 2
+    HEADING = 3
+    MAG = 4
+    WHEEL = 5
+    BODY_VELOCITY = 6
+    BARO = 7
+    PSEUDORANGE = 8
+    RANGE_RATE = 9
+    ZUPT = 10
+    ZARU = 11
+    NHC = 12
 
 
 STREAM_NAMES = tuple(stream.name.lower() for stream in Stream)
+
+CONSTRAINTS = (Stream.ZUPT, Stream.ZARU, Stream.NHC)
+
+CONSTRAINT_INTERVAL = 100_000_000
+"""The grid of the constraints (ns)."""
 
 STATE = np.dtype(
     [
@@ -175,7 +197,7 @@ STATE = np.dtype(
 
 IMU = np.dtype([("stamp", "i8"), ("specific_force", "f8", (3,)), ("angular_rate", "f8", (3,))], align=True)
 
-PAYLOAD_SIZE = 9
+PAYLOAD_SIZE = 16
 AID = np.dtype(
     [
         ("stamp", "i8"),
@@ -194,7 +216,8 @@ AID = np.dtype(
 )
 """One offered measurement: what was sent, what became of it, and whether ``take_live`` has told that already.
 
-``source``: which of several receivers it is from.
+``source``: which of several receivers it is from. ``payload``: three values, the upper triangle of their covariance by
+rows, and what else the file of the aid says.
 """
 
 RECORD = np.dtype(
@@ -259,6 +282,7 @@ SETTINGS = np.dtype(
         ("correlated_share", "f8"),
         ("gate", "f8", (len(Stream), 4)),
         ("reach", "i8", (len(Stream),)),
+        ("constrains", "i8", (len(Stream),)),
         ("static_duration", "f8"),
         ("moving_start_after", "f8"),
         ("still_gyro_std", "f8"),
@@ -292,7 +316,8 @@ SETTINGS = np.dtype(
 )
 """Parameters as the kernels use them: radians, body axes, gate thresholds by stream and degrees of freedom.
 
-``reach``: how many errors have to be in use for a measurement of a stream. ``NAME_at``: place of an optional error, or
+``reach``: how many errors have to be in use for a measurement of a stream. ``constrains``: which constraints are
+switched on. ``NAME_at``: place of an optional error, or
 `NOWHERE`. ``optional_*``, from the first place behind the core: standard deviation at first, white noise that drives it
 (unit/rtHz), inverse correlation time (1/s).
 """

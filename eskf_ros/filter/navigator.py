@@ -8,7 +8,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import chdtri
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
@@ -29,15 +28,12 @@ from eskf_ros.filter.alignment import (
 from eskf_ros.filter.door import admit
 from eskf_ros.filter.layout import (
     AID,
-    ERROR_SIZE,
+    CONSTRAINTS,
     IMU,
     LOCAL,
     NEVER,
-    NOWHERE,
     ODOMETRY,
-    OPTIONAL_SIZES,
     RECORD,
-    SETTINGS,
     STATE,
     TIMELINE,
     WORK,
@@ -52,6 +48,7 @@ from eskf_ros.filter.monitors import complaints
 from eskf_ros.filter.optional import join
 from eskf_ros.filter.output import status_of, write_odometry
 from eskf_ros.filter.recovery import is_near_gate, judge_filter, update_weighed_down, watch_solution
+from eskf_ros.filter.settings import intakes_from, settings_from
 from eskf_ros.filter.strapdown import SECOND, propagate
 from eskf_ros.filter.timeline import (
     CHECKPOINT_SPACING,
@@ -68,7 +65,7 @@ from eskf_ros.filter.timeline import (
 from eskf_ros.filter.update import update
 from eskf_ros.filter.warm_start import Memory, recall
 from eskf_ros.parameters import Parameters
-from eskf_ros.rotation import from_roll_pitch_yaw, to_matrix
+from eskf_ros.rotation import to_matrix
 
 FloatArray = npt.NDArray[np.float64]
 StampArray = npt.NDArray[np.int64]
@@ -76,9 +73,11 @@ StampArray = npt.NDArray[np.int64]
 GNSS_POSITION = int(Stream.GNSS_POSITION)
 GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
 OPEN_DOOR = int(Verdict.WAITING)
+FIRST_CONSTRAINT = int(min(CONSTRAINTS))
 FUSED = int(Verdict.FUSED)
 DUPLICATE = int(Verdict.DUPLICATE)
 BEFORE_ALIGNMENT = int(Verdict.BEFORE_ALIGNMENT)
+INACTIVE = int(Verdict.INACTIVE)
 
 LONGEST_GAP = 5 * SECOND
 """The IMU was silent for longer (ns): nothing is left of attitude and velocity, start again."""
@@ -86,8 +85,7 @@ LONGEST_GAP = 5 * SECOND
 IMU_BATCH = 1024
 
 HIGHEST_ALTITUDE = 1e5
-HIGHEST_SPEED = 600.0
-"""What no receiver on a robot reports (m, m/s)."""
+"""What no receiver on a robot reports (m)."""
 
 NO_STAND_IN = (0.0, 0.0, 0.0)
 """The covariance of a message is its own."""
@@ -179,18 +177,21 @@ def fuse(state, aids, i, settings, work):
         note_position(state, aid, settings)
     elif aid.stream == GNSS_VELOCITY:
         note_velocity(state, aid, settings)
-    if state.level_known == 0 or (state.position_known == 0 and aid.stream != GNSS_POSITION):
-        aid.verdict = BEFORE_ALIGNMENT
+    if not is_aligned_for(state, aid.stream):
+        aid.verdict = BEFORE_ALIGNMENT if aid.stream < FIRST_CONSTRAINT else INACTIVE
         return
     position = (state.position_map[0], state.position_map[1], state.position_map[2])
     heading = heading_of(state, settings)
-    if state.position_known == 0:
+    if state.position_known == 0 and aid.stream == GNSS_POSITION:
         start_position(state, aid.payload)
         recall_heading(state, aid.payload, settings)
     join(state, settings.reach[aid.stream], settings)
     if aid.stream == GNSS_POSITION:
         watch_solution(state, aid, settings)
     size = linearize(state, aid, settings, work)
+    if size == 0:
+        aid.verdict = INACTIVE
+        return
     gate = settings.gate[aid.stream, size]
     for k in range(size):
         aid.innovation[k] = work.innovation[k]
@@ -207,8 +208,23 @@ def fuse(state, aids, i, settings, work):
 
 
 @njit
+def is_aligned_for(state, stream):
+    """Say whether the start-up is far enough for a measurement of a stream."""
+    if state.level_known == 0:
+        return False
+    if stream == GNSS_POSITION:
+        return True
+    if stream == GNSS_VELOCITY:
+        return state.position_known == 1
+    return state.position_known == 1 and state.heading_known == 1
+
+
+@njit
 def linearize(state, aid, settings, work):
-    """Write innovation, Jacobian and noise of one measurement to ``work``; return its size. The list of aids."""
+    """Write innovation, Jacobian and noise of one measurement to ``work``; return its size. The list of aids.
+
+    Size 0: the measurement says nothing in this state.
+    """
     if aid.stream == GNSS_POSITION:
         return gnss_position.linearize(state, aid.payload, aid.source, settings, work)
     return gnss_velocity.linearize(state, aid.payload, aid.source, settings, work)
@@ -244,6 +260,7 @@ class Navigator:
         """Use other parameters from now on; history within the window is judged by them when it is applied again."""
         self.parameters = parameters
         self._settings = settings_from(parameters, self._output_rate)
+        self._intakes = intakes_from(parameters)
         if self._memory is not None:
             recall(*self._memory, parameters, self._settings[0])
 
@@ -332,7 +349,15 @@ class Navigator:
             self._make_room()
             batch = min(first + IMU_BATCH, len(stamps))
             first = insert_imu(
-                self._imu, self._timeline, self._local, stamps[:batch], specific_force, angular_rate, first
+                self._imu,
+                self._aids,
+                self._timeline,
+                self._local,
+                self._settings,
+                stamps[:batch],
+                specific_force,
+                angular_rate,
+                first,
             )
             parts.append(self.update())
         return parts[0] if len(parts) == 1 else np.concatenate([np.zeros(0, ODOMETRY), *parts])
@@ -371,17 +396,15 @@ class Navigator:
         ``gnss.status_std_horizontal`` and ``_vertical``. ``frame_id`` tells which antenna it is.
         """
         gnss = self.parameters.gnss
-        matrix = np.ascontiguousarray(covariance, np.float64)
         stand_in = NO_STAND_IN
+        matrix = np.ascontiguousarray(covariance, np.float64)
         if covariance_type == 0 or not matrix.any():
             level = min(max(status, 0), 2)
             horizontal, vertical = gnss.status_std_horizontal[level] ** 2, gnss.status_std_vertical[level] ** 2
             stand_in = (horizontal, horizontal, vertical)
         values = (math.radians(latitude_deg), math.radians(longitude_deg), float(altitude))
-        aid = self._admit(values, matrix, stand_in, gnss.covariance_scale, gnss.position_std_floor)
-        if not gnss.use_position:
-            aid["door"] = Verdict.DISABLED
-        elif status < 0:
+        aid = self._admit(Stream.GNSS_POSITION, values, matrix, stand_in)
+        if aid["door"] == Verdict.WAITING and status < 0:
             aid["door"] = Verdict.NO_FIX
         elif aid["door"] == Verdict.WAITING and (
             abs(latitude_deg) > 90.0 or abs(longitude_deg) > 360.0 or abs(altitude) > HIGHEST_ALTITUDE
@@ -402,18 +425,24 @@ class Navigator:
         An all-zero or absent covariance (first number negative) becomes ``gnss.unknown_velocity_std``. ``frame_id``
         tells which antenna it is.
         """
-        gnss = self.parameters.gnss
-        matrix = np.ascontiguousarray(covariance, np.float64)
-        stand_in = NO_STAND_IN
-        if matrix[0] < 0.0 or not matrix.any():
-            stand_in = (gnss.unknown_velocity_std**2,) * 3
-        values = (float(velocity_enu[0]), float(velocity_enu[1]), float(velocity_enu[2]))
-        aid = self._admit(values, matrix, stand_in, gnss.covariance_scale, gnss.velocity_std_floor)
-        if not gnss.use_velocity:
-            aid["door"] = Verdict.DISABLED
-        elif aid["door"] == Verdict.WAITING and max(map(abs, values)) > HIGHEST_SPEED:
-            aid["door"] = Verdict.BAD_VALUE
+        self._take(Stream.GNSS_VELOCITY, velocity_enu, covariance)
         self._push_gnss(Stream.GNSS_VELOCITY, stamp, arrival, frame_id)
+
+    def push(
+        self,
+        stream: Stream,
+        stamp: int,
+        values: Sequence[float],
+        covariance: Sequence[float] | FloatArray,
+        arrival: int = 0,
+    ) -> None:
+        """Take a measurement of any other sensor: three values with their covariance (nine numbers, row-major).
+
+        What the values are says the file of the aid in ``aiding``. An all-zero covariance takes the stand-in of the
+        parameters; an axis with a negative variance was not measured.
+        """
+        self._take(stream, values, covariance)
+        self._push_aid(stream, stamp + round(self._intakes[stream].time_offset * SECOND), arrival)
 
     def take_records(self) -> np.ndarray:
         """Return the records (RECORD) that became final since the last call: in the total order, the too late last."""
@@ -422,7 +451,7 @@ class Navigator:
     def take_live(self) -> np.ndarray:
         """Return the records of what was judged since the last call, as they stand: a later message may change them."""
         judged = self._aids[: int(self._states["aid_next"][0])]
-        new = np.flatnonzero(judged["told"] == 0)
+        new = np.flatnonzero((judged["told"] == 0) & (judged["verdict"] != INACTIVE))
         judged["told"] = 1
         return np.array([tuple(judged[name][i] for name in RECORD.names or ()) for i in new], RECORD)
 
@@ -509,8 +538,9 @@ class Navigator:
         found = complaints(self._states[0])
         if self._stand_ins:
             found.append(
-                f"{self._stand_ins} GNSS messages came without a covariance (unknown type or all zero): "
-                "gnss.status_std_horizontal, gnss.status_std_vertical and gnss.unknown_velocity_std stand in for it"
+                f"{self._stand_ins} messages came without a covariance (unknown type or all zero): "
+                "gnss.status_std_horizontal, gnss.status_std_vertical and the unknown_..._std of the parameters stand "
+                "in for it"
             )
         for stream, difference in self._stamp_difference.items():
             if 2 * self._refused_count[stream] > self._offered_count[stream]:
@@ -526,17 +556,31 @@ class Navigator:
         """Memory of the history buffers: grows with window and rates, not with time."""
         return sum(buffer.nbytes for buffer in (self._imu, self._aids, self._checkpoints, self._rows))
 
+    def _take(self, stream: Stream, values: Sequence[float], covariance: Sequence[float] | FloatArray) -> None:
+        """Fill the record that is on offer, with the stand-in where no covariance came; judge its payload."""
+        intake = self._intakes[stream]
+        matrix = np.ascontiguousarray(covariance, np.float64)
+        is_absent = not matrix.any() or (matrix[0] < 0.0 and not intake.may_lack_axes)
+        x, y, z = intake.unknown_std
+        stand_in = (x * x, y * y, z * z) if is_absent else NO_STAND_IN
+        self._admit(stream, (float(values[0]), float(values[1]), float(values[2])), matrix, stand_in)
+
     def _admit(
         self,
+        stream: Stream,
         values: tuple[float, float, float],
         covariance: FloatArray,
         stand_in: tuple[float, float, float],
-        scale: float,
-        std_floor: float,
     ) -> np.ndarray:
         """Fill the record that is on offer, and judge its payload."""
-        admit(self._offered, values, covariance, stand_in, scale, std_floor)
+        intake = self._intakes[stream]
+        scale, floor, lacks = intake.covariance_scale, intake.std_floor, intake.may_lack_axes
+        admit(self._offered, values, covariance, stand_in, scale, floor, lacks)
         aid = self._offered[0]
+        if not intake.is_used:
+            aid["door"] = Verdict.DISABLED
+        elif aid["door"] == Verdict.WAITING and max(map(abs, values)) > intake.largest:
+            aid["door"] = Verdict.BAD_VALUE
         if aid["door"] == Verdict.WAITING and stand_in is not NO_STAND_IN:
             self._stand_ins += 1
         return aid
@@ -583,9 +627,11 @@ class Navigator:
         """See that one batch of IMU samples with its checkpoints, and one aid, fit into the buffers."""
         timeline = self._timeline
         checkpoints_needed = IMU_BATCH // CHECKPOINT_SPACING + 2
+        # An interval between two samples has room for one grid point of the constraints.
+        aids_needed = 2 + IMU_BATCH * int(self._settings["constrains"].sum())
         if (
             len(self._imu) >= timeline["imu_count"][0] + IMU_BATCH
-            and len(self._aids) > timeline["aid_count"][0] + 1
+            and len(self._aids) >= timeline["aid_count"][0] + aids_needed
             and len(self._checkpoints) >= timeline["checkpoint_count"][0] + checkpoints_needed
         ):
             return
@@ -593,7 +639,7 @@ class Navigator:
         while len(self._imu) < 2 * (timeline["imu_count"][0] + IMU_BATCH):
             self._imu = doubled(self._imu)
             self._rows = doubled(self._rows)
-        while len(self._aids) < 2 * (timeline["aid_count"][0] + 2):
+        while len(self._aids) < 2 * (timeline["aid_count"][0] + aids_needed):
             self._aids = doubled(self._aids)
         while len(self._checkpoints) < 2 * (timeline["checkpoint_count"][0] + checkpoints_needed):
             self._checkpoints = doubled(self._checkpoints)
@@ -621,66 +667,3 @@ def compile_kernels() -> None:
 def _copied(records: np.ndarray, count: int) -> np.ndarray:
     """Return the first records in memory of their own: through bytes, because numpy copies them field by field."""
     return np.frombuffer(bytearray(records[:count].tobytes()), records.dtype)
-
-
-def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarray:
-    """Return the parameters as the kernels use them (SETTINGS): radians, lever arms from the IMU in its axes."""
-    settings = allocate(SETTINGS)
-    imu, alignment = parameters.imu, parameters.alignment
-    for name in (
-        "gyro_noise_density",
-        "accel_noise_density",
-        "gyro_bias_random_walk",
-        "accel_bias_random_walk",
-        "gyro_bias_std",
-        "accel_bias_std",
-    ):
-        settings[name] = getattr(imu, name)
-    settings["imu_gap"] = imu.gap
-    settings["gap_accel_std"] = imu.gap_accel_std
-    settings["gap_gyro_std"] = imu.gap_gyro_std
-    roll, pitch, yaw = (math.radians(angle) for angle in imu.mount_rpy_deg)
-    imu_to_base = np.array(to_matrix(from_roll_pitch_yaw(roll, pitch, yaw)))
-    settings["imu_to_base"] = imu_to_base
-    settings["imu_position_base"] = imu.mount_position
-    lever_arms_base = np.subtract([parameters.gnss.lever_arm, parameters.second_gnss.lever_arm], imu.mount_position)
-    settings["lever_arms_body"] = lever_arms_base @ imu_to_base
-    for stream in (Stream.GNSS_POSITION, Stream.GNSS_VELOCITY):
-        settings["gate"][0, stream, 1:] = chdtri([1, 2, 3], 1.0 - parameters.gnss.gate_probability)
-    settings["correlated_share"] = parameters.gnss.correlated_share
-    place_optional_states(settings[0], parameters)
-    settings["static_duration"] = alignment.static_duration
-    settings["moving_start_after"] = alignment.moving_start_after
-    settings["still_gyro_std"] = alignment.still_gyro_std
-    settings["still_accel_std"] = alignment.still_accel_std
-    settings["moving_tilt_std"] = math.radians(alignment.moving_tilt_std_deg)
-    settings["initial_heading"] = math.radians(alignment.initial_heading_deg)
-    settings["initial_heading_std"] = math.radians(alignment.initial_heading_std_deg)
-    settings["use_course"] = alignment.use_course
-    settings["found_heading_std"] = math.radians(alignment.found_heading_std_deg)
-    settings["course_min_speed"] = alignment.course_min_speed
-    settings["course_std"] = math.radians(alignment.course_std_deg)
-    settings["good_heading_std"] = math.radians(alignment.good_heading_std_deg)
-    settings["output_interval"] = round(SECOND / output_rate) if output_rate > 0.0 else 0
-    return settings
-
-
-def place_optional_states(settings: np.void, parameters: Parameters) -> None:
-    """Give the optional states that are switched on their places and their models, and the streams their reach."""
-    settings["reach"] = end = ERROR_SIZE
-    time = parameters.gnss.correlation_time
-    # Name, whether it is on, first deviation, driving noise, correlation time (0: random walk), streams that need it.
-    blocks: tuple[tuple[str, bool, float, float, float, tuple[Stream, ...]], ...] = (
-        ("position_error", time > 0.0, 1.0, math.sqrt(2.0 / time) if time else 0.0, time, (Stream.GNSS_POSITION,)),
-    )
-    for name, is_on, std, noise_density, time, streams in blocks:
-        settings[f"{name}_at"] = end if is_on else NOWHERE
-        if not is_on:
-            continue
-        place = slice(end - ERROR_SIZE, end - ERROR_SIZE + OPTIONAL_SIZES[name])
-        settings["optional_std"][place] = std
-        settings["optional_noise_density"][place] = noise_density
-        settings["optional_decay"][place] = 1.0 / time if time > 0.0 else 0.0
-        end += OPTIONAL_SIZES[name]
-        for stream in streams:
-            settings["reach"][stream] = end

@@ -5,6 +5,9 @@ copy of the whole state right after an IMU sample and before the aids of the sam
 only marks how far to go back: the next advance restores the newest checkpoint before it and applies again all that
 follows, so the result is a function of the sorted contents alone.
 
+Constraints (rest, no side slip), which no sensor sends, lie among the aids on a grid of stamps, wherever IMU samples
+are close together.
+
 A message is in time if its stamp is not older than the newest IMU stamp (the frontier) minus the window.
 """
 
@@ -15,12 +18,14 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.layout import NEVER, Verdict, allocate
+from eskf_ros.filter.layout import CONSTRAINT_INTERVAL, CONSTRAINTS, NEVER, Verdict, allocate
 
 WAITING = int(Verdict.WAITING)
 BAD_STAMP = int(Verdict.BAD_STAMP)
 BEFORE_ALIGNMENT = int(Verdict.BEFORE_ALIGNMENT)
 OUTSIDE_HISTORY = int(Verdict.OUTSIDE_HISTORY)
+INACTIVE = int(Verdict.INACTIVE)
+FIRST_CONSTRAINT = int(min(CONSTRAINTS))
 
 EARLY_AIDS = 4096
 """So many aids may wait for the first IMU sample."""
@@ -119,8 +124,14 @@ def confirm_jump(timeline, stamp):
 
 
 @njit
-def begin_again(timeline):
-    """Take back all IMU samples: the next advance starts from the blank state, with the aids that are there."""
+def begin_again(aids, timeline):
+    """Take back all IMU samples: the next advance starts from the blank state, with the aids that sensors sent."""
+    kept = timeline.recorded
+    for i in range(timeline.recorded, timeline.aid_count):
+        if aids[i].stream < FIRST_CONSTRAINT:
+            aids[kept] = aids[i]
+            kept += 1
+    timeline.aid_count = kept
     timeline.imu_count = 0
     timeline.frontier = NEVER
     timeline.published = NEVER
@@ -129,13 +140,14 @@ def begin_again(timeline):
 
 
 @njit
-def insert_imu(imu, timeline, locals_, stamps, specific_force, angular_rate, first):
+def insert_imu(imu, aids, timeline, locals_, settings_, stamps, specific_force, angular_rate, first):
     """Sort samples ``first`` and following into the buffer; return how many were taken before it was full.
 
     Each is checked at the door: finite, possible, stamp neither too old nor absurdly far from the others. Of two with
-    one stamp the one with the smaller bits stays.
+    one stamp the one with the smaller bits stays. The constraints on the grid come with the samples around them.
     """
     t = timeline[0]
+    gap = min(round(settings_[0].imu_gap * 1e9), CONSTRAINT_INTERVAL)
     k = first
     while k < len(stamps) and t.imu_count < len(imu):
         stamp = stamps[k]
@@ -154,7 +166,7 @@ def insert_imu(imu, timeline, locals_, stamps, specific_force, angular_rate, fir
                 t.imu_bad_stamp += 1
                 continue
             if stamp < t.frontier:
-                begin_again(t)
+                begin_again(aids, t)
         elif stamp < oldest_in_time(t):
             t.imu_late += 1
             t.furthest_late = max(t.furthest_late, t.frontier - stamp)
@@ -169,6 +181,11 @@ def insert_imu(imu, timeline, locals_, stamps, specific_force, angular_rate, fir
                 continue
             place -= 1
         else:
+            before = imu[place - 1].stamp if place > 0 else NEVER
+            after = imu[place].stamp if place < t.imu_count else NEVER
+            if before == NEVER or after == NEVER or after - before > gap:
+                add_constraints(aids, t, settings_[0], before, stamp, gap)
+                add_constraints(aids, t, settings_[0], stamp, after, gap)
             for i in range(t.imu_count, place, -1):
                 imu[i] = imu[i - 1]
             t.imu_count += 1
@@ -180,6 +197,46 @@ def insert_imu(imu, timeline, locals_, stamps, specific_force, angular_rate, fir
             go_back_to(t, imu[place - 1].stamp if place > 0 else NEVER)
         t.frontier = max(t.frontier, stamp)
     return k
+
+
+@njit
+def add_constraints(aids, t, settings, after, until, gap):
+    """Put the constraints that are switched on to the grid points in (``after``, ``until``], two IMU stamps.
+
+    None where one of them is `NEVER`, and none in a gap (ns): nobody knows what the robot did there.
+    """
+    if after == NEVER or until == NEVER or until - after > gap:
+        return
+    point = (after // CONSTRAINT_INTERVAL + 1) * CONSTRAINT_INTERVAL
+    while point <= until:
+        for stream in range(FIRST_CONSTRAINT, len(settings.constrains)):
+            if settings.constrains[stream] == 1:
+                add_constraint(aids, t, stream, point)
+        point += CONSTRAINT_INTERVAL
+
+
+@njit
+def add_constraint(aids, t, stream, stamp):
+    """Sort one constraint into the buffer, which has room."""
+    place = t.aid_count
+    while place > 0 and (
+        aids[place - 1].stamp > stamp or (aids[place - 1].stamp == stamp and aids[place - 1].stream > stream)
+    ):
+        place -= 1
+    for i in range(t.aid_count, place, -1):
+        aids[i] = aids[i - 1]
+    aid = aids[place]
+    aid.stamp = stamp
+    aid.arrival = stamp
+    aid.stream = stream
+    aid.source = 0
+    aid.door = WAITING
+    aid.verdict = WAITING
+    aid.dof = 0
+    aid.told = 0
+    for i in range(len(aid.payload)):
+        aid.payload[i] = 0.0
+    t.aid_count += 1
 
 
 @njit
@@ -299,6 +356,9 @@ def take_final(aids, timeline, out, everything):
         aid = aids[t.recorded]
         if not everything and (t.frontier == NEVER or aid.stamp >= t.frontier - t.window):
             break
+        if aid.verdict == INACTIVE:
+            t.recorded += 1
+            continue
         out[count].stamp = aid.stamp
         out[count].arrival = aid.arrival
         out[count].stream = aid.stream

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from eskf_ros.bags import Batch
 from eskf_ros.filter.layout import ODOMETRY, Status, Stream
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.replay.inputs import Input
 from eskf_ros.replay.topics import TopicNames
 
 LARGEST_PUSH = 1024
@@ -18,8 +20,8 @@ LARGEST_PUSH = 1024
 LOOK_AHEAD = 10_000_000_000
 """ns of log time within which messages are put into the order of their stamps."""
 
-Offer = tuple[int, Stream, tuple[Any, ...]]
-"""A GNSS message: how many IMU samples of the batch come before it, its stream, the arguments of the push."""
+Offer = tuple[int, Input, tuple[Any, ...]]
+"""A message: how many IMU samples of the batch come before it, what it is, the arguments of the push."""
 
 
 class Feed:
@@ -31,7 +33,7 @@ class Feed:
     Attributes:
         first_stamp: ns, the earliest IMU stamp of the first batch that has IMU samples.
         imu_count: IMU samples offered.
-        withheld: how many GNSS messages were not offered, by stream.
+        withheld: how many messages were not offered, by stream.
     """
 
     def __init__(
@@ -50,7 +52,12 @@ class Feed:
         self._gnss_over = False
         self.first_stamp: int | None = None
         self.imu_count = 0
-        self.withheld = {Stream.GNSS_POSITION: 0, Stream.GNSS_VELOCITY: 0}
+        self.withheld = {kind.stream: 0 for kind in topics.inputs}
+        self._pushes: dict[Stream, Callable[..., None]] = {
+            kind.stream: partial(navigator.push, kind.stream) for kind in topics.inputs
+        }
+        self._pushes[Stream.GNSS_POSITION] = navigator.push_gnss_position
+        self._pushes[Stream.GNSS_VELOCITY] = navigator.push_gnss_velocity
 
     def ordered(self, batches: Iterable[dict[str, Batch]]) -> Iterable[dict[str, Batch]]:
         """The batches as they have to be pushed."""
@@ -76,15 +83,13 @@ class Feed:
                 rows.append(self._navigator.push_imu(stamps[part], specific_force[part], angular_rate[part]))
                 done = part.stop
 
-        for place, stream, arguments in self._offers(batch):
+        for place, kind, arguments in self._offers(batch):
             push_imu_until(place)
             self._gnss_over = self._gnss_over or (self._ins_only and self._navigator.status >= Status.GOOD)
-            if self._gnss_over or self._in_outage(arguments[0]):
-                self.withheld[stream] += 1
-            elif stream == Stream.GNSS_POSITION:
-                self._navigator.push_gnss_position(*arguments)
+            if kind.is_gnss and (self._gnss_over or self._in_outage(arguments[0])):
+                self.withheld[kind.stream] += 1
             else:
-                self._navigator.push_gnss_velocity(*arguments)
+                self._pushes[kind.stream](*arguments)
         if imu is not None:
             push_imu_until(len(stamps))
         # As bytes: numpy copies structured arrays field by field and takes ten times as long.
@@ -102,48 +107,20 @@ class Feed:
         return batch.messages["stamp"] if self._by_stamp else batch.log_time
 
     def _offers(self, batch: dict[str, Batch]) -> list[Offer]:
-        """The GNSS messages of a batch in their order."""
+        """The messages of a batch, but for the IMU, in their order."""
         imu = batch.get(self._topics.imu)
         imu_time = np.zeros(0, np.int64) if imu is None else self._time(imu)
         offers: list[tuple[int, Offer]] = []
-        fixes = batch.get(self._topics.gnss_fix)
-        if fixes is not None:
-            names = (
-                "stamp",
-                "latitude",
-                "longitude",
-                "altitude",
-                "position_covariance",
-                "position_covariance_type",
-                "status",
-            )
-            columns = [_listed(fixes.messages[name]) for name in names]
-            times, places = self._time(fixes), np.searchsorted(imu_time, self._time(fixes))
-            arguments = zip(*columns, fixes.log_time.tolist(), strict=True)
-            offers += _with_place(times, places, Stream.GNSS_POSITION, arguments)
-        velocities = batch.get(self._topics.gnss_velocity)
-        if velocities is not None:
-            covariances = velocities.messages["twist_covariance"].reshape(-1, 6, 6)[:, :3, :3].reshape(-1, 9)
-            columns = [_listed(velocities.messages["stamp"]), _listed(velocities.messages["linear_velocity"])]
-            times, places = self._time(velocities), np.searchsorted(imu_time, self._time(velocities))
-            arguments = zip(*columns, _listed(covariances), velocities.log_time.tolist(), strict=True)
-            offers += _with_place(times, places, Stream.GNSS_VELOCITY, arguments)
+        for kind, topic in self._topics.inputs.items():
+            part = batch.get(topic)
+            if part is None:
+                continue
+            times = self._time(part)
+            places = np.searchsorted(imu_time, times)
+            for time, place, arguments in zip(times.tolist(), places.tolist(), kind.arguments(part), strict=True):
+                offers.append((time, (place, kind, arguments)))
         offers.sort(key=lambda item: item[0])
         return [offer for _, offer in offers]
-
-
-def _listed(column: NDArray[Any]) -> list[Any]:
-    """Numbers as Python numbers, vectors as arrays."""
-    return column.tolist() if column.ndim == 1 else list(np.ascontiguousarray(column))
-
-
-def _with_place(
-    times: NDArray[np.int64], places: NDArray[np.intp], stream: Stream, arguments: Iterable[tuple[Any, ...]]
-) -> list[tuple[int, Offer]]:
-    return [
-        (time, (place, stream, values))
-        for time, place, values in zip(times.tolist(), places.tolist(), arguments, strict=True)
-    ]
 
 
 def in_stamp_order(batches: Iterable[dict[str, Batch]]) -> Iterator[dict[str, Batch]]:

@@ -16,9 +16,10 @@ from eskf_ros.filter.layout import ODOMETRY
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.parameters import Parameters
 from eskf_ros.replay.feed import Feed
+from eskf_ros.replay.inputs import FIX
 from eskf_ros.replay.results import ResultFiles, selected
 from eskf_ros.replay.summary import Summary, truth_result
-from eskf_ros.replay.topics import FIX, find_topics, truth_converter
+from eskf_ros.replay.topics import find_topics, truth_converter
 from eskf_ros.replay.truth import TruthComparison
 
 TRUTH_RATE = 50.0

@@ -87,9 +87,13 @@ class Summary:
             "wall_s": wall_s,
             "realtime_factor": duration / wall_s,
             "datum": None if navigator.datum is None else list(navigator.datum),
-            "aids": {STREAM_NAMES[stream]: self._aid(stream) for stream in self._feed.withheld},
+            "aids": {STREAM_NAMES[stream]: self._aid(stream) for stream in self._aids()},
             "final": final_result(final, navigator.datum),
         }
+
+    def _aids(self) -> list[Stream]:
+        """The inputs of the recording, and the constraints that were ever active."""
+        return [stream for stream in Stream if stream in self._feed.withheld or self._verdicts[stream].any()]
 
     def _aid(self, stream: Stream) -> dict[str, Any]:
         """`rejected` is every verdict but fused, waiting, and outside_history, which is `late`."""
@@ -102,7 +106,7 @@ class Summary:
             "fused": fused,
             "rejected": offered - fused - late - waiting,
             "late": late,
-            "withheld": self._feed.withheld[stream],
+            "withheld": self._feed.withheld.get(stream, 0),
             "nis_mean": float(self._nis_sum[stream] / tested) if tested else None,
             "nis_in_95": float(self._nis_inside[stream] / tested) if tested else None,
             "verdicts": self._verdict_counts(stream),
@@ -134,8 +138,7 @@ class Summary:
                 f"the alignment started again {navigator.restarts} times: the IMU was silent for seconds, or fix after "
                 "fix contradicted the filter (IMU noise parameters too small, wrong mounting, lever arm or time offset)"
             )
-        names = {Stream.GNSS_POSITION: topics.gnss_fix, Stream.GNSS_VELOCITY: topics.gnss_velocity}
-        late = {name: int(self._verdicts[stream, Verdict.OUTSIDE_HISTORY]) for stream, name in names.items()}
+        late = {name: int(self._verdicts[kind.stream, Verdict.OUTSIDE_HISTORY]) for kind, name in topics.inputs.items()}
         late[topics.imu] = navigator.imu_counts["late"]
         if any(late.values()):
             counts = ", ".join(f"{count} of {name}" for name, count in late.items() if count)
@@ -147,9 +150,8 @@ class Summary:
             verdicts = ", ".join(
                 f"{count} {name}" for name, count in self._verdict_counts(Stream.GNSS_POSITION).items()
             )
-            lines.append(
-                f"no position was found; what became of the fixes of {topics.gnss_fix}: {verdicts or 'none came'}"
-            )
+            fixes = topics.of(Stream.GNSS_POSITION)
+            lines.append(f"no position was found; what became of the fixes of {fixes}: {verdicts or 'none came'}")
         return lines
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.bags import BagReader, Batch
+from eskf_ros.filter.layout import Stream
 from eskf_ros.parameters import Parameters, Topics
+from eskf_ros.replay.inputs import FIX, INPUTS, TWIST, Input
 from eskf_ros.replay.truth import epochs_from_fix, epochs_from_odometry
 from eskf_ros.simulate.map_frame import MapFrame
 
 IMU = "sensor_msgs/msg/Imu"
-FIX = "sensor_msgs/msg/NavSatFix"
-VELOCITY = "geometry_msgs/msg/TwistWithCovarianceStamped"
 ODOMETRY = "nav_msgs/msg/Odometry"
 
 
@@ -30,43 +30,55 @@ class TopicNames:
     """Names as they are in the recording; empty: not there, or not wanted."""
 
     imu: str
-    gnss_fix: str
-    gnss_velocity: str = ""
+    inputs: Mapping[Input, str]
     truth: str = ""
     truth_type: str = ""
 
     def wanted(self) -> dict[str, str]:
         """What to read: topic -> type."""
-        types = {self.imu: IMU, self.gnss_fix: FIX, self.gnss_velocity: VELOCITY, self.truth: self.truth_type}
-        return {topic: kind for topic, kind in types.items() if topic}
+        types = {self.imu: IMU, **{topic: kind.type for kind, topic in self.inputs.items()}}
+        return types | ({self.truth: self.truth_type} if self.truth else {})
+
+    def of(self, stream: Stream) -> str:
+        """The topic of a stream; empty if it has none."""
+        return next((topic for kind, topic in self.inputs.items() if kind.stream == stream), "")
 
 
 def find_topics(reader: BagReader, bag: Path, names: Topics, truth: str) -> tuple[TopicNames, list[str]]:
     """Find the topics of the parameters `names`, and the `truth` topic unless empty, in the recording.
 
-    The GNSS velocity may be missing as long as its name is the default; a list of hints then says what else could be
-    meant.
+    All but IMU and fix may be missing as long as their names are the defaults; a list of hints says what else could be
+    the GNSS velocity.
 
     Raises:
         InputError: another topic is missing, has no messages or the wrong type.
     """
-    hints = []
     imu = _require(reader, bag, names.imu, (IMU,), "set topics.imu in --config FILE")
-    gnss_fix = _require(reader, bag, names.gnss_fix, (FIX,), "set topics.gnss_fix in --config FILE")
-    gnss_velocity = ""
-    if _find(reader, names.gnss_velocity) or names.gnss_velocity != Topics().gnss_velocity:
-        remedy = "set topics.gnss_velocity in --config FILE"
-        gnss_velocity = _require(reader, bag, names.gnss_velocity, (VELOCITY,), remedy)
-    elif others := [topic for topic, info in sorted(reader.topics.items()) if info.type == VELOCITY and info.count]:
-        hints.append(
-            f"no GNSS velocity on {names.gnss_velocity}; if {others[0]} is one, set topics.gnss_velocity to it"
-        )
+    inputs = {}
+    for kind in INPUTS:
+        name, remedy = getattr(names, kind.name), f"set topics.{kind.name} in --config FILE"
+        is_required = kind.stream == Stream.GNSS_POSITION or name != getattr(Topics(), kind.name)
+        if is_required or _find(reader, name):
+            inputs[kind] = _require(reader, bag, name, (kind.type,), remedy)
+    hints = [] if any(kind.stream == Stream.GNSS_VELOCITY for kind in inputs) else _velocity_hint(reader, names, inputs)
     if not truth:
-        return TopicNames(imu, gnss_fix, gnss_velocity), hints
+        return TopicNames(imu, inputs), hints
     topic = _require(reader, bag, truth, (ODOMETRY, FIX), "name it with --truth TOPIC")
-    if topic in (imu, gnss_fix, gnss_velocity):
+    if topic in (imu, *inputs.values()):
         raise InputError(f"{bag}: --truth {truth} is an input of the estimator; truth has to be another topic")
-    return TopicNames(imu, gnss_fix, gnss_velocity, topic, reader.topics[topic].type), hints
+    return TopicNames(imu, inputs, topic, reader.topics[topic].type), hints
+
+
+def _velocity_hint(reader: BagReader, names: Topics, inputs: Mapping[Input, str]) -> list[str]:
+    taken = inputs.values()
+    others = [
+        topic
+        for topic, info in sorted(reader.topics.items())
+        if info.type == TWIST and info.count and topic not in taken
+    ]
+    if not others:
+        return []
+    return [f"no GNSS velocity on {names.gnss_velocity}; if {others[0]} is one, set topics.gnss_velocity to it"]
 
 
 def _find(reader: BagReader, name: str) -> str:

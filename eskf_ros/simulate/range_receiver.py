@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from eskf_ros.gnss import time as gnss_time
-from eskf_ros.gnss.ephemeris import Broadcast, Ephemerides
+from eskf_ros.gnss.ephemeris import EPHEMERIS, Broadcast, Ephemerides
+from eskf_ros.gnss.range_files import read_navigation_files
 from eskf_ros.gnss.range_model import NO_KLOBUCHAR
 from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, allocate_ranges, locate
-from eskf_ros.gnss.rinex_nav import read_navigation
 from eskf_ros.gnss.signals import GNSS_COUNT, LETTERS, SIGNALS, SPEED_OF_LIGHT, Gnss, time_group
 from eskf_ros.gnss.weighting import DEFAULT_WEIGHTING
 from eskf_ros.simulate import constellation
@@ -58,7 +58,8 @@ class RangeReceiver:
 
     ``rate`` in Hz, ``latency``: shortest and longest seconds from an epoch to its arrival. ``systems``: letters of
     RINEX, of whose satellites the first signal is tracked above ``elevation_mask_deg``. ``nav``: a RINEX navigation
-    file that covers the time of the scenario; none takes the sky of `eskf_ros.simulate.constellation`. With
+    file that covers the time of the scenario; none takes the sky of `eskf_ros.simulate.constellation`.
+    ``clock_offset``: seconds by which the stamps are ahead of UTC, to have the sky of another day. With
     ``satellites`` the messages bring the states of the satellites, and no ephemerides are needed; with ``stds`` they
     bring standard deviations.
 
@@ -77,6 +78,7 @@ class RangeReceiver:
     systems: str = "GEC"
     elevation_mask_deg: float = 5.0
     nav: str = ""
+    clock_offset: float = 0.0
     satellites: bool = False
     stds: bool = False
     noise_scale: float = 1.0
@@ -101,7 +103,7 @@ class RangeReceiver:
     ) -> RangeMeasurements:
         """Return the measurements in ``section`` with the antenna at ``lever_arm`` (m, base_link)."""
         clock_stream, noise, cn0_noise, atmosphere, orbits, offsets, happenings, delays = generators(seed, 8)
-        geometry = _geometry(section, lever_arm, self.rate, self.systems, self.nav)
+        geometry = _geometry(section, lever_arm, self.rate, self.systems, self.nav, self.clock_offset)
         ideal, satellites, stamp = geometry.ideal, geometry.satellites, geometry.stamp
         shape, interval = ideal.shape, 1.0 / self.rate
         elapsed = section.elapsed(stamp)
@@ -253,22 +255,26 @@ class _Geometry:
 
 
 @lru_cache(maxsize=4)
-def _geometry(section: Section, lever_arm: Vector, rate: float, systems: str, nav: str) -> _Geometry:
+def _geometry(
+    section: Section, lever_arm: Vector, rate: float, systems: str, nav: str, clock_offset: float
+) -> _Geometry:
     """Raise ValueError (RinexError) for a file that cannot be read, and when it covers nothing of the section."""
+    stamp = section.stamps(rate, GNSS_PHASE)
+    if not len(stamp):
+        raise ValueError(f"at {rate:g} Hz there is no epoch of ranges from {section.start:g} s to {section.stop:g} s")
+    instants = [gnss_time.from_unix(one) for one in (stamp - round(clock_offset * 1e9)).tolist()]
     if nav:
-        navigation = read_navigation(Path(nav))
-        broadcasts: Sequence[Broadcast] = navigation.broadcasts
-        klobuchar: Mapping[Gnss, Array] = navigation.klobuchar
+        files = read_navigation_files([Path(nav)])
+        broadcasts: Sequence[Broadcast] = files.serving(instants[0], instants[-1])
+        klobuchar: Mapping[Gnss, Array] = files.klobuchar
     else:
         broadcasts, klobuchar = constellation.messages(), constellation.KLOBUCHAR
     wanted = {LETTERS[letter] for letter in systems}
     broadcasts = [broadcast for broadcast in broadcasts if broadcast.gnss in wanted]
-    ephemerides = Ephemerides(np.array([broadcast.record() for broadcast in broadcasts]))
+    ephemerides = Ephemerides(np.array([broadcast.record() for broadcast in broadcasts], EPHEMERIS))
     first_signal = {signal.gnss: index for index, signal in reversed(list(enumerate(SIGNALS)))}
     names = sorted({(broadcast.gnss, broadcast.sv_id) for broadcast in broadcasts})
     satellites = np.array([(gnss, sv_id, first_signal[gnss]) for gnss, sv_id in names], np.int64).reshape(-1, 3)
-    stamp = section.stamps(rate, GNSS_PHASE)
-    instants = [gnss_time.from_unix(one) for one in stamp.tolist()]
     weeks = np.array([week for week, _ in instants], np.int64)
     seconds = np.array([second for _, second in instants])
     motion = section.motion(stamp)
