@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +29,7 @@ from eskf_ros.simulate.map_frame import MapFrame
 from eskf_ros.simulate.motion import Motion, checked_times
 from eskf_ros.simulate.range_episodes import StreetCanyon
 from eskf_ros.simulate.range_receiver import RangeReceiver
-from eskf_ros.simulate.sampling import START_STAMP, RandomStream, Section, Stamps, seed_of
+from eskf_ros.simulate.sampling import START_STAMP, RandomStream, Section, seed_of
 from recordings.common import (
     GNSS_LATENCY,
     STATUS_FIX,
@@ -42,7 +41,6 @@ from recordings.common import (
     gnss_velocity,
     gps_to_unix,
     imu,
-    nanoseconds,
     pose_in_earth,
     read_rtklib,
     write_bag,
@@ -114,21 +112,6 @@ def euler_rate_matrices(angles: Array, rates: Array) -> tuple[Array, Array]:
     return np.moveaxis(np.array(matrices), -1, 0), np.moveaxis(np.array(derivatives), -1, 0)
 
 
-@dataclass(frozen=True)
-class RecordedSection(Section):
-    """A drive that begins at ``start_stamp`` (ns of Unix time) instead of the time zero of all scenarios."""
-
-    start_stamp: int = START_STAMP
-
-    def stamps(self, rate: float, phase: float) -> Stamps:
-        """Return the stamps of a sensor that measures ``phase`` seconds after the start, then at ``rate`` Hz."""
-        return super().stamps(rate, phase) - START_STAMP + self.start_stamp
-
-    def elapsed(self, stamps: Stamps) -> Array:
-        """Return seconds from the start."""
-        return super().elapsed(stamps - self.start_stamp + START_STAMP)
-
-
 def nagoya_recording(folder: Path, source: Path, grade: str = "consumer", seed: int = 1) -> Recording:
     """Write the drive (the folder `source`) to `folder`, with an IMU of `grade`, the real fixes, and truth at 5 Hz."""
     solution_time, solution = read_rtklib(source / "rover_1Hz_spp.pos")
@@ -139,7 +122,7 @@ def nagoya_recording(folder: Path, source: Path, grade: str = "consumer", seed: 
     bag = folder / f"nagoya_{grade}.mcap"
     write_bag(
         bag,
-        *imu_and_truth(read_section(source), grade, seed),
+        *imu_and_truth(*read_drive(source), grade, seed),
         gnss_fix(fixes, 0.0),
         gnss_velocity(solution_time, solution[:, [14, 13, 15]], velocity_std, solution_time + GNSS_LATENCY),
     )
@@ -154,21 +137,22 @@ def nagoya_ranges_recording(
     episodes: Sequence[Episode] = STREETS,
 ) -> Recording:
     """Write the drive with simulated ranges to the real satellites of that day, and our own point solutions of them."""
-    section = read_section(source)
-    receiver = RangeReceiver(rate=RANGE_RATE, systems="GEC", nav=str(source / "base.nav"))
+    section, start = read_drive(source)
+    late = START_STAMP * 1e-9 - start
+    receiver = RangeReceiver(rate=RANGE_RATE, nav=str(source / "base.nav"), clock_offset=late)
     measured = receiver.measure(section, LEVER_ARM, episodes, seed_of(seed, RandomStream.RANGES))
     counts = range(len(measured.stamp))
-    epochs = RangeEpochs(measured.stamp * 1e-9, WEEK, measured.seconds, [measured.epoch(k) for k in counts])
+    epochs = RangeEpochs(measured.stamp * 1e-9 - late, WEEK, measured.seconds, [measured.epoch(k) for k in counts])
     ephemerides = Ephemerides(np.array([broadcast.record() for broadcast in measured.broadcasts]))
     fixes, velocity_time, velocity, velocity_std = solved_fixes(epochs, ephemerides, measured.klobuchar[Gnss.GPS])
     bag = folder / f"nagoya_ranges_{grade}.mcap"
     write_bag(
         bag,
-        *imu_and_truth(section, grade, seed),
+        *imu_and_truth(section, start, grade, seed),
         gnss_fix(fixes, 0.0),
         gnss_velocity(velocity_time, velocity, velocity_std, velocity_time + GNSS_LATENCY),
-        gnss_ranges(epochs, measured.arrival * 1e-9),
-        gnss_ephemerides(section.start_stamp * 1e-9, measured.broadcasts, measured.klobuchar),
+        gnss_ranges(epochs, measured.arrival * 1e-9 - late),
+        gnss_ephemerides(start, measured.broadcasts, measured.klobuchar),
     )
     return Recording(bag, RANGES_INSTALLATION, noise_lines(grade))
 
@@ -178,9 +162,9 @@ def noise_lines(grade: str) -> str:
     return "".join(f"    {name}: {value}\n" for name, value in grade_parameters(grade).items())
 
 
-def imu_and_truth(section: RecordedSection, grade: str, seed: int) -> tuple[Messages, Messages]:
+def imu_and_truth(section: Section, start: float, grade: str, seed: int) -> tuple[Messages, Messages]:
     """`imu/data` of an IMU of `grade`, and `truth`."""
-    noise, trajectory, frame, start = grade_parameters(grade), section.path, section.frame, section.start_stamp * 1e-9
+    noise, trajectory, frame = grade_parameters(grade), section.path, section.frame
     times = np.arange(1, int(trajectory.duration * IMU_RATE) + 1) / IMU_RATE
     specific_force, angular_rate = ideal_samples(trajectory, frame, times)
     gyro, accelerometer = (
@@ -205,8 +189,8 @@ def enu_covariance(std: Array) -> Array:
     return squares[:, [1, 3, 4, 3, 0, 5, 4, 5, 2]].reshape(-1, 3, 3)
 
 
-def read_section(source: Path) -> RecordedSection:
-    """The whole drive."""
+def read_drive(source: Path) -> tuple[Section, float]:
+    """The whole drive, and the Unix time (s) of its start."""
     table = np.loadtxt(source / "reference.csv", delimiter=",", skiprows=1)
     frame = MapFrame((float(table[0, 2]), float(table[0, 3]), float(table[0, 4])))
     position_map = (table[:, 5:8] - frame.origin_ecef) @ frame.rotation_map_to_ecef
@@ -214,5 +198,5 @@ def read_section(source: Path) -> RecordedSection:
     roll, pitch, heading = np.radians(table[:, 8:11]).T
     angles = np.column_stack([roll, -pitch, 0.5 * np.pi - heading])
     trajectory = RecordedTrajectory(table[:, 0] - table[0, 0], position_map, angles)
-    start = int(nanoseconds(gps_to_unix(WEEK, table[:1, 0], LEAP_SECONDS))[0])
-    return RecordedSection(trajectory, frame, 0.0, trajectory.duration, start)
+    start = float(gps_to_unix(WEEK, table[0, 0], LEAP_SECONDS))
+    return Section(trajectory, frame, 0.0, trajectory.duration), start

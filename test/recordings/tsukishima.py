@@ -82,6 +82,7 @@ INSTALLATION = f"""\
     imu.mount_rpy_deg: [-2.3, 0.0, -89.7]
     gnss.lever_arm: [0.0, 0.0, 0.6]
     gnss.time_offset: {TIME_OFFSET}
+    wheel.time_offset: {-WHEEL_AGE}
 """
 
 NOISE = """\
@@ -126,7 +127,7 @@ def tsukishima_recording(folder: Path, source: Path) -> Recording:
             velocity_std[whole],
             velocity_time[whole] + TIME_OFFSET + GNSS_LATENCY,
         ),
-        wheel(time - WHEEL_AGE, speed, WHEEL_STD, time),
+        wheel(time, speed, WHEEL_STD, time),
         truth_fix(fixes[confirmed & ~given], TIME_OFFSET),
     )
     return Recording(bag, INSTALLATION, NOISE)
@@ -155,7 +156,7 @@ def tsukishima_ranges_recording(folder: Path, source: Path) -> Recording:
         gnss_velocity(velocity_time, velocity, velocity_std, velocity_time + TIME_OFFSET + GNSS_LATENCY),
         gnss_ranges(epochs, epochs.time + TIME_OFFSET + GNSS_LATENCY),
         gnss_ephemerides(time[0], read_navigation(source / "base.nav").broadcasts),
-        wheel(time[during] - WHEEL_AGE, speed[during], WHEEL_STD, time[during]),
+        wheel(time[during], speed[during], WHEEL_STD, time[during]),
         truth_fix(truth, TIME_OFFSET),
         truth_fix(shifted(truth, shift), TIME_OFFSET, "truth_shifted"),
     )
