@@ -28,6 +28,7 @@ from eskf_ros.filter.layout import (
     RECORD,
     STREAM_NAMES,
     VELOCITY,
+    Stream,
     Verdict,
 )
 from eskf_ros.filter.navigator import Navigator
@@ -92,8 +93,14 @@ def feed(recording: Recording, navigator: Navigator, stops: NDArray[np.int64]) -
     makes no difference to the state (principle of the timeline) but to the time it takes.
     """
     fix = velocity = sample = 0
+    others = [_wheel_messages(recording), _body_velocity_messages(recording)]
+    given = [0] * len(others)
     for i in stops:
         now = recording.imu_arrival[i]
+        for kind, messages in enumerate(others):
+            while given[kind] < len(messages) and messages[given[kind]][-1] <= now:
+                navigator.push(*messages[given[kind]])
+                given[kind] += 1
         while fix < len(recording.fix_stamp) and recording.fix_arrival[fix] <= now:
             navigator.push_gnss_position(
                 int(recording.fix_stamp[fix]),
@@ -118,6 +125,31 @@ def feed(recording: Recording, navigator: Navigator, stops: NDArray[np.int64]) -
         navigator.push_imu(recording.imu_stamp[part], recording.specific_force[part], recording.angular_rate[part])
         sample = i + 1
         yield int(i), navigator.state[0]
+
+
+def _wheel_messages(recording: Recording) -> list[tuple[Any, ...]]:
+    """Arguments of `Navigator.push` of all messages of the wheels; the last is the arrival."""
+    wheel = recording.wheel
+    if wheel is None:
+        return []
+    covariance = np.diag([wheel.speed_variance, wheel.yaw_rate_variance, -1.0]).ravel()
+    values = np.column_stack([wheel.speed, wheel.yaw_rate, np.zeros(len(wheel.speed))])
+    return [
+        (Stream.WHEEL, int(stamp), value, covariance, int(arrival))
+        for stamp, value, arrival in zip(wheel.stamp, values, wheel.arrival)
+    ]
+
+
+def _body_velocity_messages(recording: Recording) -> list[tuple[Any, ...]]:
+    """The same of the sensor of body velocity."""
+    body = recording.body_velocity
+    if body is None:
+        return []
+    covariance = np.diag(body.variance).ravel()
+    return [
+        (Stream.BODY_VELOCITY, int(stamp), velocity, covariance, int(arrival))
+        for stamp, velocity, arrival in zip(body.stamp, body.velocity, body.arrival)
+    ]
 
 
 def state_error(recording: Recording, i: int, truth: int, state: np.void) -> Array:

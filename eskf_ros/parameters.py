@@ -398,6 +398,23 @@ class Mag(Aid):
 
 @dataclass(frozen=True)
 class Wheel(Aid):
+    position: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0),
+        "m",
+        "The point of base_link whose forward speed the wheels show: the middle of the axle they are on, or the place "
+        "of a single wheel.",
+        minimum=-1000.0,
+        maximum=1000.0,
+    )
+    slip: float = _parameter(
+        0.005,
+        "s2/m",
+        "Tyres slip by this share of the speed for every m/s2 of acceleration. The default is that of a car on dry "
+        "asphalt; loose ground takes several times as much.",
+        minimum=0.0,
+        maximum=1.0,
+        live=True,
+    )
     speed_std_floor: float = _parameter(
         0.05,
         "m/s",
@@ -467,6 +484,84 @@ class Nhc:
         "For vehicles on wheels: they move neither sideways nor up and down at the rear axle (non-holonomic "
         "constraint).",
         live=True,
+    )
+    position: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0),
+        "m",
+        "The point of base_link that does not move sideways: the middle of the axle that does not steer, usually the "
+        "rear one.",
+        minimum=-1000.0,
+        maximum=1000.0,
+    )
+    lateral_std: float = _parameter(
+        0.05,
+        "m/s",
+        "Standard deviation of the lateral velocity, however slow the vehicle is.",
+        above=0.0,
+        maximum=100.0,
+        live=True,
+    )
+    vertical_std: float = _parameter(
+        0.1,
+        "m/s",
+        "The same of the vertical velocity: bumps and springs.",
+        above=0.0,
+        maximum=100.0,
+        live=True,
+    )
+    angle_std_deg: float = _parameter(
+        0.3,
+        "deg",
+        "How far the direction of travel differs from the axes of the vehicle on a straight road (camber, side wind), "
+        "as a standard deviation.",
+        minimum=0.0,
+        maximum=90.0,
+        live=True,
+    )
+    slip: float = _parameter(
+        0.01,
+        "rad s2/m",
+        "What acceleration adds to this angle, by side slip of the tyres in turns, and by springs, for every m/s2. The "
+        "default is about twice what a car shows, because these errors last for seconds.",
+        minimum=0.0,
+        maximum=1.0,
+        live=True,
+    )
+
+
+@dataclass(frozen=True)
+class Estimate:
+    wheel_scale: bool = _parameter(
+        True,
+        "",
+        "Estimate what the wheels multiply the speed with: nobody knows the radius of a tyre to a per mille.",
+    )
+    wheel_scale_std: float = _parameter(
+        0.03, "", "Standard deviation of the scale of the wheels at start.", above=0.0, maximum=1.0
+    )
+    wheel_scale_random_walk: float = _parameter(
+        5.0e-5,
+        "1/rtHz",
+        "How fast the scale of the wheels wanders with load and tyre pressure: by this value times the square root of "
+        "the seconds passed.",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    mounting: bool = _parameter(
+        True,
+        "",
+        "Estimate yaw and pitch of the direction in which the vehicle rolls against the x axis of base_link, where "
+        "wheels or nhc need it.",
+    )
+    mounting_std_deg: float = _parameter(
+        2.0, "deg", "Standard deviation of these angles at start.", above=0.0, maximum=45.0
+    )
+    mounting_random_walk: float = _parameter(
+        3.0e-5,
+        "rad/rtHz",
+        "How fast these angles wander with the load: by this value times the square root of the seconds passed.",
+        minimum=0.0,
+        maximum=1.0,
     )
 
 
@@ -645,6 +740,7 @@ class Parameters:
     baro: Baro = _group(Baro, "Barometer.")
     zupt: Zupt = _group(Zupt, "Standing still.")
     nhc: Nhc = _group(Nhc, "Non-holonomic constraint.")
+    estimate: Estimate = _group(Estimate, "What is estimated besides the motion and the biases of the IMU.")
     history: History = _group(History, "Late and out-of-order messages.")
     alignment: Alignment = _group(Alignment, "Start-up: levelling, heading, and when the estimate is called good.")
     warm_start: WarmStart = _group(WarmStart, "What the node remembers of its last run.")

@@ -124,6 +124,22 @@ def test_motion_is_within_what_its_kind_can_do(name: str) -> None:
     assert abs(off) < 1e-9, "the heading at the start is the one that is stated"
 
 
+def test_tyres_that_slip_turn_the_body_into_the_curve() -> None:
+    """The heading leads the course by the slip; what the rear axle does sideways is all that differs."""
+    instructions = (SpeedTo(9.0), Turn(90.0, 2.5), Hold(3.0), SpeedTo(4.0), Turn(-60.0))
+    slip = 0.01
+    rolling, slipping = DriveTrajectory(instructions), DriveTrajectory(instructions, side_slip=slip)
+    t = np.linspace(0.0, rolling.duration, 400)
+    straight, turned = rolling.motion(t), slipping.motion(t)
+    np.testing.assert_array_equal(turned.position_map, straight.position_map)
+    (vx, vy, _), (ax, ay, _) = straight.velocity_map.T, straight.acceleration_map.T
+    lateral = (vx * ay - vy * ax) / np.maximum(np.hypot(vx, vy), 1e-9)
+    change = roll_pitch_yaw(turned)[:, 2] - roll_pitch_yaw(straight)[:, 2]
+    np.testing.assert_allclose(change, slip * lateral, rtol=0.0, atol=1e-4)
+    assert change.max() > 0.02
+    assert change.min() < -0.015
+
+
 @pytest.mark.parametrize("name", [*WHEELED, "multirotor", "aeroplane"])
 def test_what_stands_on_the_ground_starts_and_ends_at_rest(name: str) -> None:
     path = trajectory(name)

@@ -23,7 +23,7 @@ ACCEL_BIAS = 9
 GYRO_BIAS = 12
 ERROR_SIZE = 15
 
-OPTIONAL_SIZES = {"position_error": 3}
+OPTIONAL_SIZES = {"position_error": 3, "mounting": 2, "wheel_scale": 1}
 """Optional errors behind the core, and how many each is: see ``optional``."""
 
 OPTIONAL_CAPACITY = sum(OPTIONAL_SIZES.values())
@@ -107,8 +107,12 @@ STREAM_NAMES = tuple(stream.name.lower() for stream in Stream)
 
 CONSTRAINTS = (Stream.ZUPT, Stream.ZARU, Stream.NHC)
 
-CONSTRAINT_INTERVAL = 100_000_000
-"""The grid of the constraints (ns)."""
+CONSTRAINT_INTERVAL = 1_000_000_000
+"""The grid of the constraints (ns).
+
+What makes them wrong (side slip, a body that sways) lasts for about half as long at the least: closer together they
+would not be independent of each other, and the filter would believe their mean too much.
+"""
 
 STATE = np.dtype(
     [
@@ -177,6 +181,16 @@ STATE = np.dtype(
         ("still_stamp", "i8"),
         ("still_count", "i8"),
         ("still_sum", "f8", (6,)),
+        # IMU samples since the last point on the grid of the constraints: the point after them, whether one is missing,
+        # how many, sums.
+        ("block_end", "i8"),
+        ("block_broken", "i8"),
+        ("block_count", "i8"),
+        ("block_sum", "f8", (6,)),
+        ("block_square_sum", "f8", (6,)),
+        # Wheels: when they spoke last, and when the gate last refused to believe them.
+        ("wheel_stamp", "i8"),
+        ("slip_stamp", "i8"),
         # Monitors: windows seen, those at rest, and those in which the IMU cannot be what it should be.
         ("windows", "i8"),
         ("rest_windows", "i8"),
@@ -280,6 +294,13 @@ SETTINGS = np.dtype(
         ("imu_position_base", "f8", (3,)),
         ("lever_arms_body", "f8", (SOURCES, 3)),
         ("correlated_share", "f8"),
+        ("wheel_arm_body", "f8", (3,)),
+        ("wheel_slip", "f8"),
+        ("nhc_arm_body", "f8", (3,)),
+        ("nhc_lateral_std", "f8"),
+        ("nhc_vertical_std", "f8"),
+        ("nhc_angle_std", "f8"),
+        ("nhc_slip", "f8"),
         ("gate", "f8", (len(Stream), 4)),
         ("reach", "i8", (len(Stream),)),
         ("constrains", "i8", (len(Stream),)),
@@ -388,7 +409,7 @@ def allocate(dtype: np.dtype, count: int = 1) -> np.ndarray:
     return memory if COMPILED else memory.view(np.recarray)
 
 
-_EVIDENCE = ("still_stamp", "motion_stamp", "last_fix_stamp", "anchor_stamp")
+_EVIDENCE = ("still_stamp", "motion_stamp", "last_fix_stamp", "anchor_stamp", "block_end", "wheel_stamp", "slip_stamp")
 
 
 def blank_state() -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
-from eskf_ros.filter.aiding import gnss_position, gnss_velocity
+from eskf_ros.filter.aiding import gnss_position, gnss_velocity, nhc, wheel
 from eskf_ros.filter.alignment import (
     heading_of,
     move_datum,
@@ -49,6 +49,7 @@ from eskf_ros.filter.optional import join
 from eskf_ros.filter.output import status_of, write_odometry
 from eskf_ros.filter.recovery import is_near_gate, judge_filter, update_weighed_down, watch_solution
 from eskf_ros.filter.settings import intakes_from, settings_from
+from eskf_ros.filter.stillness import add_to_block, watch_wheels
 from eskf_ros.filter.strapdown import SECOND, propagate
 from eskf_ros.filter.timeline import (
     CHECKPOINT_SPACING,
@@ -72,6 +73,8 @@ StampArray = npt.NDArray[np.int64]
 
 GNSS_POSITION = int(Stream.GNSS_POSITION)
 GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
+WHEEL = int(Stream.WHEEL)
+NHC = int(Stream.NHC)
 OPEN_DOOR = int(Verdict.WAITING)
 FIRST_CONSTRAINT = int(min(CONSTRAINTS))
 FUSED = int(Verdict.FUSED)
@@ -114,6 +117,7 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
         take_sample(state, sample)
         measure_step(state, settings)
         watch_stillness(state, settings)
+        add_to_block(state, settings)
         save_checkpoint(states, checkpoints, t)
 
         is_new = sample.stamp > t.published and state.level_known == 1
@@ -204,6 +208,8 @@ def fuse(state, aids, i, settings, work):
         search_heading(state, aid, gate, settings, work)
     if aid.stream == GNSS_POSITION:
         judge_filter(state, aid.verdict)
+    elif aid.stream == WHEEL:
+        watch_wheels(state, aid)
     note_jump(state, position, heading, settings)
 
 
@@ -227,6 +233,10 @@ def linearize(state, aid, settings, work):
     """
     if aid.stream == GNSS_POSITION:
         return gnss_position.linearize(state, aid.payload, aid.source, settings, work)
+    if aid.stream == WHEEL:
+        return wheel.linearize(state, aid.payload, settings, work)
+    if aid.stream == NHC:
+        return nhc.linearize(state, settings, work)
     return gnss_velocity.linearize(state, aid.payload, aid.source, settings, work)
 
 

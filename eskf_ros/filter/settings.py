@@ -132,6 +132,7 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
     settings["constrains"][0, Stream.ZUPT] = settings["constrains"][0, Stream.ZARU] = parameters.zupt.enabled
     settings["constrains"][0, Stream.NHC] = parameters.nhc.enabled
     settings["correlated_share"] = parameters.gnss.correlated_share
+    describe_vehicle(settings[0], parameters)
     place_optional_states(settings[0], parameters)
     settings["static_duration"] = alignment.static_duration
     settings["moving_start_after"] = alignment.moving_start_after
@@ -149,13 +150,31 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
     return settings
 
 
+def describe_vehicle(settings: np.void, parameters: Parameters) -> None:
+    """Fill in what wheels and the constraints of a vehicle need: arms from the IMU in its axes, deviations."""
+    wheel, nhc = parameters.wheel, parameters.nhc
+    for name, position in (("wheel", wheel.position), ("nhc", nhc.position)):
+        arm_base = np.subtract(position, parameters.imu.mount_position)
+        settings[f"{name}_arm_body"] = arm_base @ settings["imu_to_base"]
+    settings["wheel_slip"] = wheel.slip
+    settings["nhc_lateral_std"] = nhc.lateral_std
+    settings["nhc_vertical_std"] = nhc.vertical_std
+    settings["nhc_angle_std"] = math.radians(nhc.angle_std_deg)
+    settings["nhc_slip"] = nhc.slip
+
+
 def place_optional_states(settings: np.void, parameters: Parameters) -> None:
     """Give the optional states that are switched on their places and their models, and the streams their reach."""
     settings["reach"] = end = ERROR_SIZE
     time = parameters.gnss.correlation_time
+    estimate = parameters.estimate
+    mounting_std, mounting_walk = math.radians(estimate.mounting_std_deg), estimate.mounting_random_walk
+    scale_std, scale_walk = estimate.wheel_scale_std, estimate.wheel_scale_random_walk
     # Name, whether it is on, first deviation, driving noise, correlation time (0: random walk), streams that need it.
     blocks: tuple[tuple[str, bool, float, float, float, tuple[Stream, ...]], ...] = (
         ("position_error", time > 0.0, 1.0, math.sqrt(2.0 / time) if time else 0.0, time, (Stream.GNSS_POSITION,)),
+        ("mounting", estimate.mounting, mounting_std, mounting_walk, 0.0, (Stream.NHC, Stream.WHEEL)),
+        ("wheel_scale", estimate.wheel_scale, scale_std, scale_walk, 0.0, (Stream.WHEEL,)),
     )
     for name, is_on, std, noise_density, time, streams in blocks:
         settings[f"{name}_at"] = end if is_on else NOWHERE

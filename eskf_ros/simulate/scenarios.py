@@ -22,7 +22,7 @@ from eskf_ros.simulate.profile import (
     Turn,
     TurnInPlace,
 )
-from eskf_ros.simulate.trajectory import DriveTrajectory
+from eskf_ros.simulate.trajectory import SIDE_SLIP_PER_ACCELERATION, DriveTrajectory
 from eskf_ros.simulate.walk import WalkTrajectory
 
 
@@ -69,6 +69,37 @@ _CITY_LAP: tuple[Instruction, ...] = (
     Turn(90.0, 2.5),
     SpeedTo(0.0, 1.5),
     Hold(5.0),
+)
+
+TUNNEL_START = 162.0
+"""Seconds from time zero."""
+
+_TUNNEL: tuple[Instruction, ...] = (
+    SpeedTo(15.0),
+    Hold(15.0),
+    Turn(40.0, 1.5),
+    Hold(10.0),
+    SpeedTo(9.0, 1.5),
+    Turn(-70.0, 1.5),
+    SpeedTo(0.0, 2.0),
+    Hold(8.0),
+    SpeedTo(4.0, 1.5),
+    Hold(6.0),
+    SpeedTo(16.0, 1.5),
+    Hold(20.0),
+    Turn(55.0, 1.5),
+    Hold(25.0),
+    SpeedTo(11.0, 1.0),
+    Turn(-90.0, 1.5),
+    Hold(20.0),
+    SpeedTo(0.0, 1.5),
+    Hold(20.0),
+    SpeedTo(13.0, 1.5),
+    Hold(30.0),
+    Turn(-45.0, 1.5),
+    Hold(20.0),
+    SpeedTo(18.0, 1.0),
+    Hold(30.0),
 )
 
 _ROWS: tuple[Instruction, ...] = (
@@ -217,6 +248,12 @@ SCENARIOS: dict[str, Scenario] = {
         "one hour of city laps, for measuring speed",
         _drive((Hold(20.0), *(_CITY_LAP * 27), Hold(47.5))),
         heading_deg=35.0,
+    ),
+    "long_tunnel": Scenario(
+        "a city lap, then five minutes in a tunnel with bends, slow traffic and stops, on tyres that slip sideways",
+        _drive((Hold(20.0), *_CITY_LAP, *_TUNNEL), side_slip=SIDE_SLIP_PER_ACCELERATION),
+        heading_deg=-130.0,
+        outages=((TUNNEL_START, TUNNEL_START + 300.0),),
     ),
     "reverse_start": Scenario(
         "a car backs out of its place before it drives",

@@ -1,9 +1,11 @@
 """The motion of a simulated car: driving instructions turned into a smooth trajectory.
 
-Speed, distance and heading are those of `eskf_ros.simulate.profile`. base_link is the middle of the rear axle: its
-velocity points along the heading, up and down with the slope of the road. The body squats with acceleration and rolls
-with lateral acceleration. Velocity, acceleration, attitude and angular rate are closed expressions of these; only
-position is a quadrature, exact to rounding. So all of them are derivatives of each other to machine precision.
+Speed, distance and course are those of `eskf_ros.simulate.profile`. base_link is the middle of the rear axle: its
+velocity points along the course, up and down with the slope of the road. The heading is the course, or, on tyres that
+slip sideways, turned into the curve by an angle in proportion to the lateral acceleration. The body squats with
+acceleration and rolls with lateral acceleration. Velocity, acceleration, attitude and angular rate are closed
+expressions of these; only position is a quadrature, exact to rounding. So all of them are derivatives of each other to
+machine precision.
 
 All of it is in ``map``: a frame rigidly fixed to the Earth, x east, y north, z up at the datum.
 """
@@ -27,6 +29,9 @@ PITCH_PER_ACCELERATION = math.radians(2.0) / 9.80665
 ROLL_PER_ACCELERATION = math.radians(4.0) / 9.80665
 """Tilt of a car's body on its springs, rad per m/s2 (usual figures: 2 deg/g in pitch, 4 deg/g in roll)."""
 
+SIDE_SLIP_PER_ACCELERATION = math.radians(2.5) / 9.80665
+"""Side slip of rear tyres, rad per m/s2 (usual figure: 2.5 deg/g)."""
+
 HILLS = ((0.030, 700.0), (0.015, 190.0))
 """Slope of the road over the distance driven: a sum of sines, each (amplitude in rad, wave length in m)."""
 
@@ -40,11 +45,13 @@ class DriveTrajectory:
         heading_deg: float = 0.0,
         speed: float = 0.0,
         hills: Sequence[tuple[float, float]] = HILLS,
+        side_slip: float = 0.0,
     ) -> None:
         """Prepare the drive.
 
         ``heading_deg`` is the heading at the start, counter-clockwise from east (REP-103), ``speed`` the speed there
-        in m/s, backwards below zero. Raises ValueError for an instruction that cannot be followed (a turn while
+        in m/s, backwards below zero. ``side_slip`` is the angle from the course to the heading in rad per m/s2 of
+        lateral acceleration. Raises ValueError for an instruction that cannot be followed (a turn while
         standing).
         """
         profile = Profile(instructions, speed)
@@ -57,6 +64,7 @@ class DriveTrajectory:
         self._way = stacked(distance, states)
         self._profile = stacked(distance, states, rates, rates.derivative(), rates.derivative(2))
         self._hills = tuple(hills)
+        self._side_slip = side_slip
         self._position = PositionIntegral(self._velocity, self.breakpoints)
 
     @property
@@ -82,11 +90,13 @@ class DriveTrajectory:
         )
 
         # REP-103: pitch is positive nose down, roll positive right side down.
-        roll = ROLL_PER_ACCELERATION * speed * yaw_rate
-        roll_rate = ROLL_PER_ACCELERATION * (acceleration * yaw_rate + speed * yaw_acceleration)
-        roll_acceleration = ROLL_PER_ACCELERATION * (
-            jerk * yaw_rate + 2.0 * acceleration * yaw_acceleration + speed * yaw_jerk
+        lateral = (
+            speed * yaw_rate,
+            acceleration * yaw_rate + speed * yaw_acceleration,
+            jerk * yaw_rate + 2.0 * acceleration * yaw_acceleration + speed * yaw_jerk,
         )
+        roll, roll_rate, roll_acceleration = (ROLL_PER_ACCELERATION * part for part in lateral)
+        slip, slip_rate, slip_acceleration = (self._side_slip * part for part in lateral)
         pitch = -slope - PITCH_PER_ACCELERATION * acceleration
         pitch_rate = -slope_rate - PITCH_PER_ACCELERATION * jerk
         pitch_acceleration = (
@@ -94,14 +104,14 @@ class DriveTrajectory:
         )
         rate, rate_derivative = _body_rates(
             (roll, pitch),
-            (roll_rate, pitch_rate, yaw_rate),
-            (roll_acceleration, pitch_acceleration, yaw_acceleration),
+            (roll_rate, pitch_rate, yaw_rate + slip_rate),
+            (roll_acceleration, pitch_acceleration, yaw_acceleration + slip_acceleration),
         )
         return Motion(
             position_map=self._position(t),
             velocity_map=speed[:, None] * along,
             acceleration_map=acceleration_map,
-            attitude_body_to_map=_quaternions(roll, pitch, yaw),
+            attitude_body_to_map=_quaternions(roll, pitch, yaw + slip),
             angular_rate_body=rate,
             angular_acceleration_body=rate_derivative,
         )

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 from eskf_ros.compiled import njit
-from eskf_ros.filter.layout import ERROR_CAPACITY
-from eskf_ros.rotation import rotate, rotate_back
+from eskf_ros.filter.layout import ATTITUDE, ERROR_CAPACITY, ERROR_SIZE, GYRO_BIAS, VELOCITY
+from eskf_ros.filter.strapdown import gravity_map
+from eskf_ros.rotation import cross, dot, rotate, rotate_back
 
 
 @njit
@@ -51,3 +54,78 @@ def set_east_north_up_covariance(noise, state, local_to_ecef, payload, first):
         column = rotate_back(ecef, rotate(local_to_ecef, spread))
         for i in range(3):
             noise[i, j] = column[i]
+
+
+@njit
+def point_velocity(state, rotation, rate, arm):
+    """Return the velocity (m/s, IMU axes) of the point ``arm`` (m) from the IMU; ``rate`` rad/s relative to the Earth.
+
+    R' v + rate x arm (Groves, section 14.3.1).
+    """
+    velocity = rotate_back(rotation, state.velocity_map)
+    sway = cross(rate, arm)
+    return (velocity[0] + sway[0], velocity[1] + sway[1], velocity[2] + sway[2])
+
+
+@njit
+def set_point_velocity_row(jacobian, row, axis, scale, state, rotation, arm):
+    """Write how ``scale`` times the velocity of a point along ``axis`` (unit vector, IMU axes) changes with the errors.
+
+    By velocity, by the attitude (which turns the velocity, and the Earth rate that is taken off the gyro), and by the
+    gyro bias through the lever arm.
+    """
+    axis_map = rotate(rotation, axis)
+    lever = cross(axis, arm)
+    turned = cross(axis_map, state.velocity_map)
+    earth = cross(rotate(rotation, lever), state.earth_rate_map)
+    for j in range(3):
+        jacobian[row, VELOCITY + j] = scale * axis_map[j]
+        jacobian[row, ATTITUDE + j] = scale * (turned[j] + earth[j])
+        jacobian[row, GYRO_BIAS + j] = scale * lever[j]
+
+
+@njit
+def mounting_of(state, settings):
+    """Return yaw and pitch (rad) of the axes of the vehicle in base_link: it rolls along its own x axis."""
+    place = settings.mounting_at
+    if place >= state.error_size:
+        return 0.0, 0.0
+    return state.optional[place - ERROR_SIZE], state.optional[place - ERROR_SIZE + 1]
+
+
+@njit
+def vehicle_axes(state, settings):
+    """Return the unit vectors forward, left and up of the vehicle in IMU axes."""
+    yaw, pitch = mounting_of(state, settings)
+    cy, sy, cp, sp = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
+    m = settings.imu_to_base
+    forward = rotate_back(m, (cy * cp, sy * cp, -sp))
+    left = rotate_back(m, (-sy, cy, 0.0))
+    up = rotate_back(m, (cy * sp, sy * sp, cp))
+    return forward, left, up
+
+
+@njit
+def set_mounting(jacobian, row, yaw_part, pitch_part, state, settings):
+    """Write how a measurement changes with yaw and pitch of the vehicle's axes, if they are estimated."""
+    place = settings.mounting_at
+    if place < state.error_size:
+        jacobian[row, place] = yaw_part
+        jacobian[row, place + 1] = pitch_part
+
+
+@njit
+def gyro_noise_variance(state, settings):
+    """Return the variance (rad2/s2 per axis) of the white noise of a single gyro reading."""
+    return settings.gyro_noise_density**2 / state.imu_interval
+
+
+@njit
+def horizontal_acceleration(state, rotation, force):
+    """Return the size (m/s2) of the horizontal acceleration behind a raw specific force (m/s2, IMU axes)."""
+    b = state.accel_bias
+    felt = rotate(rotation, (force[0] - b[0], force[1] - b[1], force[2] - b[2]))
+    g = gravity_map(state, (state.position_map[0], state.position_map[1], state.position_map[2]))
+    a = (felt[0] + g[0], felt[1] + g[1], felt[2] + g[2])
+    along = dot(a, g) / dot(g, g)
+    return math.sqrt((a[0] - along * g[0]) ** 2 + (a[1] - along * g[1]) ** 2 + (a[2] - along * g[2]) ** 2)
