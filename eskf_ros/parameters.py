@@ -77,6 +77,7 @@ _TOPIC = {
     "pattern": r"(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*",
     "pattern_text": "a ROS topic name like imu/data or /robot/imu",
 }
+_TYPE = "Message type of this topic, where the driver publishes another one. The replay takes what was recorded."
 
 
 @dataclass(frozen=True)
@@ -107,12 +108,25 @@ class Topics:
         "geometry_msgs/TwistWithCovarianceStamped: velocity of the GNSS antenna, East-North-Up.",
         **_TOPIC,
     )
+    gnss_velocity_type: str = _choice(
+        "geometry_msgs/msg/TwistWithCovarianceStamped", _TYPE, "geometry_msgs/msg/TwistStamped"
+    )
     heading: str = _parameter(
-        "gnss/heading", "", "sensor_msgs/Imu: yaw of a dual-antenna receiver, with its covariance.", **_TOPIC
+        "gnss/heading",
+        "",
+        "sensor_msgs/Imu of a dual-antenna receiver: yaw (0 = east, counter-clockwise) and pitch of the baseline; one "
+        "whose variance is above 1 rad2 is not used.",
+        **_TOPIC,
     )
     mag: str = _parameter("imu/mag", "", "sensor_msgs/MagneticField: magnetometer in the frame of the IMU.", **_TOPIC)
     wheel: str = _parameter(
         "wheel/odom", "", "nav_msgs/Odometry: wheel odometry, of which speed and yaw rate are used.", **_TOPIC
+    )
+    wheel_type: str = _choice(
+        "nav_msgs/msg/Odometry",
+        _TYPE,
+        "geometry_msgs/msg/TwistWithCovarianceStamped",
+        "geometry_msgs/msg/TwistStamped",
     )
     body_velocity: str = _parameter(
         "body_velocity",
@@ -121,7 +135,25 @@ class Topics:
         "or odometry of any kind; an axis with a negative variance is absent.",
         **_TOPIC,
     )
+    body_velocity_type: str = _choice(
+        "geometry_msgs/msg/TwistWithCovarianceStamped",
+        _TYPE,
+        "geometry_msgs/msg/TwistStamped",
+        "nav_msgs/msg/Odometry",
+    )
     baro: str = _parameter("baro", "", "sensor_msgs/FluidPressure: air pressure.", **_TOPIC)
+    ranges: str = _parameter(
+        "gnss/ranges",
+        "",
+        "sensor_msgs/PointCloud2: what the receiver measures of each satellite, one point per signal (mode tight).",
+        **_TOPIC,
+    )
+    ephemerides: str = _parameter(
+        "gnss/ephemerides",
+        "",
+        "sensor_msgs/PointCloud2: orbits and clocks of the satellites, one point per broadcast ephemeris.",
+        **_TOPIC,
+    )
 
 
 @dataclass(frozen=True)
@@ -366,6 +398,16 @@ class Aid:
 
 @dataclass(frozen=True)
 class Heading(Aid):
+    mount_rpy_deg: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0),
+        "deg",
+        "Orientation of the baseline in base_link, whose yaw and pitch the messages tell: roll, pitch, yaw about fixed "
+        "axes as in a URDF, of a frame whose x axis leads from the first antenna (of u-blox: the moving base) to the "
+        "second. [0.0, 0.0, 0.0]: the second is in front; [0.0, 0.0, 90.0]: it is on the left; [0.0, 0.0, 180.0]: it "
+        "is behind.",
+        minimum=-360.0,
+        maximum=360.0,
+    )
     std_floor_deg: float = _parameter(
         0.2, "deg", "The standard deviation is never taken smaller than this.", above=0.0, maximum=90.0, live=True
     )
@@ -461,11 +503,140 @@ class BodyVelocity(Aid):
 
 @dataclass(frozen=True)
 class Baro(Aid):
+    position: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0),
+        "m",
+        "Position of the barometer in base_link, x forward, y left, z up.",
+        minimum=-1000.0,
+        maximum=1000.0,
+    )
+    offset_std: float = _parameter(
+        300.0,
+        "m",
+        "Standard deviation at first of the difference between pressure altitude and height: weather and geoid. "
+        "It is estimated.",
+        above=0.0,
+        maximum=1.0e4,
+    )
+    offset_random_walk: float = _parameter(
+        0.1,
+        "m/s/rtHz",
+        "How fast that difference wanders, by weather, wind and warming up: by this value times the square root of the "
+        "seconds passed. The default is 6 m in one hour; more where air is blown about, as in a vehicle.",
+        minimum=0.0,
+        maximum=100.0,
+    )
+    scale_std: float = _parameter(
+        0.03,
+        "",
+        "Standard deviation of the factor by which pressure altitude grows faster or slower than height: 0.03 where "
+        "the air is 9 K warmer or colder than in the standard atmosphere. It is estimated.",
+        minimum=0.0,
+        maximum=1.0,
+    )
     std_floor: float = _parameter(
         3.0, "Pa", "The standard deviation is never taken smaller than this.", above=0.0, maximum=1.0e4, live=True
     )
     unknown_std: float = _parameter(
         10.0, "Pa", "Standard deviation where the message gives none.", above=0.0, maximum=1.0e4, live=True
+    )
+
+
+@dataclass(frozen=True)
+class Ranges(Aid):
+    use: bool = _parameter(
+        True,
+        "",
+        "Fuse the pseudoranges of topics.ranges in mode tight.",
+        live=True,
+    )
+    use_doppler: bool = _parameter(True, "", "Fuse the Doppler of topics.ranges in mode tight.", live=True)
+    time_offset: float = _parameter(
+        0.0,
+        "s",
+        "Added to the stamps: true time = stamp + offset. RINEX files are stamped with UTC: -18 or 18 s may be missing "
+        "where a recording is stamped with GPS time.",
+        minimum=-100.0,
+        maximum=100.0,
+    )
+    gate_probability: float = _parameter(
+        0.99994,
+        "",
+        "Gate of each signal: the share of good measurements that passes; 0.99994 is four standard deviations. From "
+        "2.5 on they are weighed down.",
+        above=0.0,
+        below=1.0,
+        live=True,
+    )
+    code_std_floor: float = _parameter(
+        0.3,
+        "m",
+        "The standard deviation of a pseudorange is never taken smaller than this.",
+        above=0.0,
+        maximum=1000.0,
+        live=True,
+    )
+    range_rate_std_floor: float = _parameter(
+        0.03,
+        "m/s",
+        "The standard deviation of a range rate (Doppler) is never taken smaller than this.",
+        above=0.0,
+        maximum=100.0,
+        live=True,
+    )
+    elevation_mask_deg: float = _parameter(
+        10.0, "deg", "Satellites below this elevation are not used.", minimum=-90.0, maximum=90.0, live=True
+    )
+    cn0_mask: float = _parameter(
+        28.0,
+        "dB-Hz",
+        "Signals whose carrier-to-noise density is below this are not used; an unknown one passes.",
+        minimum=0.0,
+        maximum=60.0,
+        live=True,
+    )
+    clock_drift_noise: float = _parameter(
+        0.3,
+        "m/s/rts",
+        "How fast the drift of the receiver's clock wanders: by this value times the square root of the seconds "
+        "passed. 0.1 geodetic receiver, 0.3 usual, 0.6 hand-held or shaken. Too small makes one or two satellites "
+        "worse than none.",
+        minimum=0.0,
+        maximum=1.0e3,
+        live=True,
+    )
+    clock_bias_noise: float = _parameter(
+        0.1,
+        "m/rts",
+        "How fast the bias of the receiver's clock wanders besides its drift.",
+        minimum=0.0,
+        maximum=1.0e3,
+        live=True,
+    )
+    inter_system_std: float = _parameter(
+        10.0,
+        "m",
+        "Standard deviation of the offset between a constellation and GPS in the receiver at first.",
+        above=0.0,
+        maximum=1.0e4,
+    )
+    inter_system_std_glonass: float = _parameter(30.0, "m", "The same for GLONASS.", above=0.0, maximum=1.0e4)
+    inter_system_noise: float = _parameter(
+        0.02, "m/rts", "How fast these offsets wander.", minimum=0.0, maximum=100.0, live=True
+    )
+    use_point_solution: bool = _parameter(
+        False,
+        "",
+        "In mode loose: solve each epoch of topics.ranges for position and velocity, and fuse these instead of the "
+        "receiver's own fixes.",
+    )
+    rinex_nav_files: str = _parameter(
+        "",
+        "",
+        "RINEX navigation files with the orbits and clocks of the satellites, separated by colons. Empty: they come "
+        "by topics.ephemerides, or topics.ranges brings the satellites itself.",
+        pattern=r"[^\0]*",
+        pattern_text="paths separated by colons, or nothing",
     )
 
 
@@ -728,6 +899,13 @@ class Parameters:
         minimum=(-90.0, -180.0, -1.0e4),
         maximum=(90.0, 180.0, 1.0e6),
     )
+    mode: str = _choice(
+        "loose",
+        "How GNSS is used. loose: the receiver's position and velocity (topics.gnss_fix, topics.gnss_velocity). tight: "
+        "each satellite's pseudorange and Doppler (topics.ranges) in place of the first receiver's fixes; below four "
+        "satellites the estimate then degrades gradually.",
+        "tight",
+    )
     imu: Imu = _group(Imu, "Where the IMU sits and how good it is; biases and noise are in the axes of the IMU.")
     gnss: Gnss = _group(Gnss, "The GNSS receiver: where its antenna sits and how far its messages are trusted.")
     second_gnss: SecondGnss = _group(
@@ -738,6 +916,7 @@ class Parameters:
     wheel: Wheel = _group(Wheel, "Wheel odometry.")
     body_velocity: BodyVelocity = _group(BodyVelocity, "Velocity in the axes of the vehicle.")
     baro: Baro = _group(Baro, "Barometer.")
+    ranges: Ranges = _group(Ranges, "What a GNSS receiver measures of each satellite: pseudorange and Doppler.")
     zupt: Zupt = _group(Zupt, "Standing still.")
     nhc: Nhc = _group(Nhc, "Non-holonomic constraint.")
     estimate: Estimate = _group(Estimate, "What is estimated besides the motion and the biases of the IMU.")

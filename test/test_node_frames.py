@@ -130,7 +130,7 @@ def test_what_a_parameter_gives_is_not_looked_up():
     extrinsics.note_frame(IMU, "unknown")
     extrinsics.note_frame(IMU, "base_link")
     extrinsics.note_transform(transform("base_link", "gps", (5.0, 0.0, 0.0), Rotation.identity()))
-    assert [line.split()[0] for line in extrinsics.find()] == ["imu"]
+    assert [line.split()[0] for line in extrinsics.find()] == ["IMU"]
     assert extrinsics.completed(parameters).gnss.lever_arm == (1.0, 0.0, 0.0)
     assert extrinsics.source_of(ANTENNA) == "parameters"
     assert extrinsics.source_of(IMU) == "/tf_static"

@@ -319,7 +319,7 @@ def test_places_of_the_sensors_come_from_static_transforms(ros, start):
     robot.play(start[:400])
     ros.until(lambda: robot.value("place of the IMU") == "/tf_static", what="the mount")
     assert "position 0.000 0.500 2.000 m, roll pitch yaw 0.00 0.00 90.00 deg" in node.output
-    assert robot.value("place of the antenna") == "parameters"
+    assert robot.value("place of the GNSS antenna") == "parameters"
     assert node.stop() == 0
 
 

@@ -241,6 +241,15 @@ def test_dual_antenna_gives_the_yaw_of_its_baseline(baseline: tuple[float, float
     assert_chi_square(error / math.radians(0.5))
     assert np.abs(heading.yaw).max() <= math.pi
     assert np.ptp(heading.yaw) > 5.0
+    assert (heading.pitch == 0.0).all()
+
+
+def test_dual_antenna_gives_the_pitch_of_its_baseline_if_asked() -> None:
+    baseline = (0.9, 0.2, 0.3)
+    heading = simulate("drive", 1, dual_antenna=DualAntenna(baseline, pitch_std_deg=0.8)).dual_antenna
+    assert heading is not None
+    east, north, up = enu_axes(heading.stamp, np.tile(baseline, (len(heading.stamp), 1))).T
+    assert_chi_square((heading.pitch - np.arctan2(-up, np.hypot(east, north))) / math.radians(0.8))
 
 
 def test_body_velocity_is_that_of_its_point_in_body_axes() -> None:
@@ -464,6 +473,7 @@ def test_command_writes_the_aids(tmp_path: Path) -> None:
     assert recording.dual_antenna is not None
     yaw = Rotation.from_quat(heading["orientation"]).as_euler("ZYX")
     np.testing.assert_allclose(yaw[:, 0], recording.dual_antenna.yaw, atol=1e-12)
+    np.testing.assert_allclose(yaw[:, 1], recording.dual_antenna.pitch, atol=1e-12)
     assert heading["orientation_covariance"][0, 8] == pytest.approx(math.radians(0.3) ** 2)
     assert (heading["orientation_covariance"][:, [0, 4]] > 9.0).all()
     assert (heading["angular_velocity_covariance"][:, 0] == -1.0).all()

@@ -1,12 +1,22 @@
-"""Fast typed reading and writing of rosbag2 recordings. Never imported by the node."""
+"""Fast typed reading and writing of rosbag2 recordings.
+
+The node reads serialised messages with what is imported here at once. What opens files is imported when it is asked
+for: it needs libraries that a robot has no use for.
+"""
 
 from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 from eskf_ros.bags.clouds import POINT_CLOUD, cloud_messages
 from eskf_ros.bags.errors import BagError
 from eskf_ros.bags.messages import MESSAGE_TYPES, StringTable, decode, encode, message_dtype
-from eskf_ros.bags.reader import BagReader, Batch, TopicInfo, open_bag
-from eskf_ros.bags.writer import BagWriter
+from eskf_ros.bags.records import Batch, TopicInfo
+
+if TYPE_CHECKING:
+    from eskf_ros.bags.reader import BagReader, open_bag
+    from eskf_ros.bags.writer import BagWriter
 
 __all__ = [
     "MESSAGE_TYPES",
@@ -23,3 +33,11 @@ __all__ = [
     "message_dtype",
     "open_bag",
 ]
+
+_WHEN_ASKED_FOR = {"BagReader": "reader", "open_bag": "reader", "BagWriter": "writer"}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _WHEN_ASKED_FOR:
+        raise AttributeError(f"module {__name__} has no attribute {name}")
+    return getattr(importlib.import_module(f"{__name__}.{_WHEN_ASKED_FOR[name]}"), name)

@@ -14,21 +14,12 @@ from numpy.typing import NDArray
 from eskf_ros.bags.errors import BagError
 from eskf_ros.bags.mcap_file import MAGIC, McapFile
 from eskf_ros.bags.messages import StringTable, decode, message_dtype
-from eskf_ros.bags.records import Block, Payloads, Source, TopicInfo
+from eskf_ros.bags.records import Batch, Block, Payloads, Source, TopicInfo
 from eskf_ros.bags.row_files import RosbagsDirectory, SqliteFile
 
 __all__ = ["BagReader", "Batch", "TopicInfo", "open_bag"]
 
 _BATCH_MESSAGES = 8192  # smaller batches are collected: a bag with images has few other messages in a chunk
-
-
-@dataclass
-class Batch:
-    """Messages of one topic, sorted by (log time, order in the file)."""
-
-    log_time: NDArray[np.int64]  # (n,) ns
-    messages: NDArray[Any]  # (n,) structured, see `message_dtype`
-    strings: Sequence[str]  # what `frame_id` (and `child_frame_id`) of the messages are indices into
 
 
 @dataclass

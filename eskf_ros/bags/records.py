@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,15 @@ class TopicInfo:
 
     type: str
     count: int
+
+
+@dataclass
+class Batch:
+    """Messages of one topic, sorted by (log time, order in the file)."""
+
+    log_time: NDArray[np.int64]  # (n,) ns
+    messages: NDArray[Any]  # (n,) structured, see `message_dtype`
+    strings: Sequence[str]  # what `frame_id` (and `child_frame_id`) of the messages are indices into
 
 
 class Payloads(NamedTuple):

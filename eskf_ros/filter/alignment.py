@@ -179,6 +179,7 @@ def restart(state):
     """Start the alignment again; only the datum stays."""
     state.restarts += 1
     forget_search(state)
+    state.hint_count = 0
     state.rejected_fixes = 0
     state.level_known = 0
     state.position_known = 0
@@ -187,6 +188,8 @@ def restart(state):
     state.window_start = NEVER
     state.still_stamp = NEVER
     state.still_count = 0
+    for i in range(2):
+        state.clock_known[i] = 0
     for i in range(3):
         state.jump_position[i] -= state.position_map[i]
         state.position_map[i] = 0.0
@@ -245,18 +248,24 @@ def watch_stillness(state, settings):
 
 @njit
 def note_position(state, aid, settings):
-    """Remember a fix, and look at the displacement since the one before the current stillness window."""
+    """Remember a fix, and what it says about motion."""
     fix = geodetic_to_ecef(aid.payload[0], aid.payload[1], aid.payload[2])
-    if NEVER < state.anchor_stamp < aid.stamp:
+    std = math.sqrt(max(aid.payload[3], aid.payload[6], aid.payload[8]))
+    note_place(state, fix, std, aid.stamp, settings)
+
+
+@njit
+def note_place(state, ecef, std, stamp, settings):
+    """Remember a place (m), and look at the displacement since the one before the current stillness window."""
+    if NEVER < state.anchor_stamp < stamp:
         a = state.anchor_ecef
-        step = (fix[0] - a[0], fix[1] - a[1], fix[2] - a[2])
-        std = math.sqrt(2.0 * max(aid.payload[3], aid.payload[6], aid.payload[8]))
-        seconds = (aid.stamp - state.anchor_stamp) * 1e-9
-        speed = (math.sqrt(dot(step, step)) - POSITION_SIGMAS * std) / seconds
-        note_speed(state, speed, state.anchor_stamp, aid.stamp, settings)
-    state.last_fix_stamp = aid.stamp
+        step = (ecef[0] - a[0], ecef[1] - a[1], ecef[2] - a[2])
+        seconds = (stamp - state.anchor_stamp) * 1e-9
+        speed = (math.sqrt(dot(step, step)) - POSITION_SIGMAS * math.sqrt(2.0) * std) / seconds
+        note_speed(state, speed, state.anchor_stamp, stamp, settings)
+    state.last_fix_stamp = stamp
     for i in range(3):
-        state.last_fix_ecef[i] = fix[i]
+        state.last_fix_ecef[i] = ecef[i]
 
 
 @njit
@@ -558,6 +567,15 @@ def search_heading(state, aid, gate, settings, work):
     else:
         return
     set_east_north_up_covariance(work.noise, state, local_to_ecef, aid.payload, 3)
+    search_with(state, first, measured, lever, gate, settings, work)
+
+
+@njit
+def search_with(state, first, measured, lever, gate, settings, work):
+    """Search with a position (``first`` 0, m) or velocity (2, m/s) of the antenna, covariance in ``work.noise``.
+
+    ``measured`` in map, ``lever`` (or its velocity) in the axes of the unknown heading.
+    """
     if state.search_started == 1:
         update_search(state, first, measured, lever, work.noise, gate, work)
     elif first == 0:

@@ -14,6 +14,7 @@ from enum import IntEnum
 import numpy as np
 
 from eskf_ros.compiled import COMPILED
+from eskf_ros.gnss.signals import BEIDOU_3, Gnss
 
 # Error state: first index of each block of three. These 15 are the core; every robot has them.
 POSITION = 0
@@ -23,8 +24,23 @@ ACCEL_BIAS = 9
 GYRO_BIAS = 12
 ERROR_SIZE = 15
 
-OPTIONAL_SIZES = {"position_error": 3, "mounting": 2, "wheel_scale": 1}
-"""Optional errors behind the core, and how many each is: see ``optional``."""
+OPTIONAL_SIZES = {
+    "position_error": 3,
+    "mounting": 2,
+    "wheel_scale": 1,
+    "baro_offset": 1,
+    "baro_scale": 1,
+    "clock": 2,
+    "inter_system": 6,
+}
+"""Optional errors behind the core, and how many each is: see ``optional``.
+
+``clock``: of the receiver, bias (m) and drift (m/s). ``inter_system``: by what the ranges of a constellation are longer
+than those of GPS (m), in the order of `INTER_SYSTEM`.
+"""
+
+INTER_SYSTEM = (Gnss.GALILEO, BEIDOU_3, Gnss.GLONASS, Gnss.QZSS, Gnss.BEIDOU, Gnss.SBAS)
+"""The constellations but GPS (`gnss.signals.time_group`), the most usual first: a state joins with those before it."""
 
 OPTIONAL_CAPACITY = sum(OPTIONAL_SIZES.values())
 ERROR_CAPACITY = ERROR_SIZE + OPTIONAL_CAPACITY
@@ -80,6 +96,7 @@ class Verdict(IntEnum):
     DISABLED = 11
     WEIGHED_DOWN = 12
     INACTIVE = 13
+    LOW_ELEVATION = 14
 
 
 class Stream(IntEnum):
@@ -166,6 +183,14 @@ STATE = np.dtype(
         ("search_tilt_variance", "f8"),
         ("search_age", "f8"),
         ("search_turn", "f8"),
+        # What a sensor says of the unknown heading: its rank, how often it agreed with itself since when, the last
+        # message, by how much (rad) it would turn the attitude, and its standard deviation.
+        ("hint_rank", "i8"),
+        ("hint_count", "i8"),
+        ("hint_since", "i8"),
+        ("hint_stamp", "i8"),
+        ("hint_turn", "f8"),
+        ("hint_std", "f8"),
         # External evidence of motion: when GNSS last proved it, the last fix, and the one the window started from.
         ("motion_stamp", "i8"),
         ("last_fix_stamp", "i8"),
@@ -199,11 +224,22 @@ STATE = np.dtype(
         ("tilted_windows", "i8"),
         ("tilted_force", "f8", (3,)),
         ("fast_windows", "i8"),
+        # Monitors of the heading: sums of cosine and sine, and how many. Messages of the dual antenna against the
+        # estimate; course over ground against the estimate.
+        ("heading_contrast", "f8", (3,)),
+        ("course_contrast", "f8", (3,)),
         # When absolute aids were last accepted, how many were rejected since, and how often that ended in a restart.
         ("absolute_stamp", "i8"),
         ("absolute_interval", "i8"),
         ("rejected_fixes", "i8"),
         ("restarts", "i8"),
+        # When a pressure was last accepted.
+        ("baro_stamp", "i8"),
+        # Tight coupling: whether the errors of clock bias and drift have values yet, milliseconds it has jumped by,
+        # and how often most of the satellites contradicted the state.
+        ("clock_known", "i8", (2,)),
+        ("clock_jumps", "i8"),
+        ("range_faults", "i8"),
     ],
     align=True,
 )
@@ -211,7 +247,7 @@ STATE = np.dtype(
 
 IMU = np.dtype([("stamp", "i8"), ("specific_force", "f8", (3,)), ("angular_rate", "f8", (3,))], align=True)
 
-PAYLOAD_SIZE = 16
+PAYLOAD_SIZE = 21
 AID = np.dtype(
     [
         ("stamp", "i8"),
@@ -293,6 +329,8 @@ SETTINGS = np.dtype(
         ("imu_to_base", "f8", (3, 3)),
         ("imu_position_base", "f8", (3,)),
         ("lever_arms_body", "f8", (SOURCES, 3)),
+        ("heading_lines_body", "f8", (SOURCES, 3)),
+        ("baro_arm_body", "f8", (3,)),
         ("correlated_share", "f8"),
         ("wheel_arm_body", "f8", (3,)),
         ("wheel_slip", "f8"),
@@ -301,6 +339,11 @@ SETTINGS = np.dtype(
         ("nhc_vertical_std", "f8"),
         ("nhc_angle_std", "f8"),
         ("nhc_slip", "f8"),
+        # Ranges: lowest elevation (rad), factor on variances, floors (m, m/s).
+        ("elevation_mask", "f8"),
+        ("range_covariance_scale", "f8"),
+        ("code_std_floor", "f8"),
+        ("range_rate_std_floor", "f8"),
         ("gate", "f8", (len(Stream), 4)),
         ("reach", "i8", (len(Stream),)),
         ("constrains", "i8", (len(Stream),)),
@@ -355,6 +398,9 @@ LOCAL = np.dtype(
 )
 """Pose of the IMU in `odom` (m, rad) and the variances it has gathered since the start (per axis)."""
 
+LARGEST_EPOCH = 256
+"""So many signals of an epoch are looked at together."""
+
 WORK = np.dtype(
     [
         ("half", "f8", (ACCEL_BIAS, ERROR_SIZE)),
@@ -367,6 +413,20 @@ WORK = np.dtype(
         ("gain", "f8", (ERROR_CAPACITY, 3)),
         ("residual_gain", "f8", (ERROR_CAPACITY, 3)),
         ("correction", "f8", (ERROR_CAPACITY,)),
+        # The signals of one epoch, and their least squares (see ``ranges``).
+        ("signal_count", "i8"),
+        ("signal_index", "i8", (LARGEST_EPOCH,)),
+        ("signal_innovation", "f8", (LARGEST_EPOCH,)),
+        ("signal_spread", "f8", (LARGEST_EPOCH,)),
+        ("signal_noise", "f8", (LARGEST_EPOCH,)),
+        ("signal_direction", "f8", (LARGEST_EPOCH, 3)),
+        ("signal_weight", "f8", (LARGEST_EPOCH,)),
+        ("signal_residual", "f8", (LARGEST_EPOCH,)),
+        ("signal_square", "f8", (LARGEST_EPOCH,)),
+        ("sorted", "f8", (LARGEST_EPOCH,)),
+        ("normal", "f8", (4, 4)),
+        ("right", "f8", (4,)),
+        ("step", "f8", (4,)),
     ],
     align=True,
 )
@@ -415,7 +475,8 @@ _EVIDENCE = ("still_stamp", "motion_stamp", "last_fix_stamp", "anchor_stamp", "b
 def blank_state() -> np.ndarray:
     """Return the state before the first IMU sample."""
     state = allocate(STATE)
-    for field in ("stamp", "imu_stamp", "first_stamp", "window_start", "absolute_stamp", *_EVIDENCE):
+    stamps = ("stamp", "imu_stamp", "first_stamp", "window_start", "absolute_stamp", "baro_stamp")
+    for field in (*stamps, *_EVIDENCE):
         state[field] = NEVER
     state["attitude"][0, 0] = 1.0
     state["error_size"] = ERROR_SIZE

@@ -8,7 +8,7 @@ import numpy as np
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import STANDARD_GRAVITY
-from eskf_ros.rotation import dot, rotate
+from eskf_ros.rotation import dot, rotate, wrapped
 
 NO_GRAVITY = 0.5
 """Below this part of gravity on average the accelerometer cannot be a strapdown one in m/s2, at rest or not."""
@@ -18,6 +18,13 @@ UPRIGHT_COSINE = 0.7
 FASTEST_TURN = 15.0
 """At rest gravity is within this part of its value and within 45 degrees of the z axis of base_link; nothing that
 navigates turns this fast (rad/s) for seconds."""
+
+MEMORY = 0.99
+LASTING_COUNT = 40.0
+ALIKE = 0.9
+FAR_OFF_DEG = 30.0
+"""Angles are remembered for some hundred messages; at least so many, so much alike, and on average so far from zero
+are no accident."""
 
 
 @njit
@@ -45,6 +52,58 @@ def watch_input(state, still, settings):
         state.fast_windows += 1
 
 
+@njit
+def note_contrast(sums, angle):
+    """Add an angle (rad) to sums of cosine, sine and count that forget."""
+    sums[0] = MEMORY * sums[0] + math.cos(angle)
+    sums[1] = MEMORY * sums[1] + math.sin(angle)
+    sums[2] = MEMORY * sums[2] + 1.0
+
+
+@njit
+def watch_heading(state, aid, work):
+    """Compare a yaw of the dual antenna, described by ``work``, with the estimate."""
+    if aid.source == 0 and state.heading_known == 1 and aid.payload[3] > 0.0:
+        note_contrast(state.heading_contrast, work.innovation[0])
+
+
+@njit
+def watch_course(state, aid, heading, settings):
+    """Compare the course of a GNSS velocity with the heading (rad) of a vehicle that travels along its x axis."""
+    east, north = aid.payload[0], aid.payload[1]
+    std = math.sqrt(max(aid.payload[3], aid.payload[6]))
+    fast = math.hypot(east, north) > max(settings.course_min_speed, 10.0 * std)
+    if settings.use_course == 1 and state.heading_known == 1 and fast:
+        note_contrast(state.course_contrast, wrapped(math.atan2(north, east) - heading))
+
+
+def _lasting_difference(sums: np.ndarray) -> float | None:
+    """Return the mean (deg) of angles that were noted, if they were many, all alike and far from zero."""
+    cosine, sine, count = (float(value) for value in sums)
+    if count < LASTING_COUNT or math.hypot(cosine, sine) < ALIKE * count:
+        return None
+    mean = math.degrees(math.atan2(sine, cosine))
+    return mean if abs(mean) > FAR_OFF_DEG else None
+
+
+def _heading_complaints(state: np.void) -> list[str]:
+    found = []
+    difference = _lasting_difference(state["heading_contrast"])
+    if difference is not None:
+        found.append(
+            f"the headings of the dual antenna differ from the estimate by {difference:.0f} deg: are the antennas "
+            "swapped, does heading.mount_rpy_deg match the baseline, and is yaw 0 = east, counter-clockwise?"
+        )
+    difference = _lasting_difference(state["course_contrast"])
+    if difference is not None and state["heading_contrast"][2] > 0.0:
+        found.append(
+            f"the vehicle travels at {difference:.0f} deg to the heading of the dual antenna: are the antennas "
+            "swapped, does heading.mount_rpy_deg match the baseline, and is yaw 0 = east, counter-clockwise? "
+            "(If it is made to move like this: alignment.use_course false.)"
+        )
+    return found
+
+
 def complaints(state: np.void) -> list[str]:
     """Say in one sentence each what is wrong with the IMU stream, and what to do; empty when nothing is."""
     found = []
@@ -66,4 +125,4 @@ def complaints(state: np.void) -> list[str]:
         found.append(
             f"the gyro reads more than {FASTEST_TURN:.0f} rad/s for seconds: is it in deg/s? REP-103 wants rad/s"
         )
-    return found
+    return found + _heading_complaints(state)

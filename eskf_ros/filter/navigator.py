@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
-from eskf_ros.filter.aiding import gnss_position, gnss_velocity, nhc, wheel
+from eskf_ros.filter.aiding import baro, gnss_position, gnss_velocity, heading, nhc, wheel
 from eskf_ros.filter.alignment import (
     heading_of,
     move_datum,
@@ -25,7 +25,8 @@ from eskf_ros.filter.alignment import (
     start_position,
     watch_stillness,
 )
-from eskf_ros.filter.door import admit
+from eskf_ros.filter.door import ABSENT, admit
+from eskf_ros.filter.heading_hints import is_heading_told
 from eskf_ros.filter.layout import (
     AID,
     CONSTRAINTS,
@@ -44,10 +45,17 @@ from eskf_ros.filter.layout import (
     blank_state,
 )
 from eskf_ros.filter.local import carry, measure_step, note_jump
-from eskf_ros.filter.monitors import complaints
+from eskf_ros.filter.monitors import complaints, watch_course, watch_heading
 from eskf_ros.filter.optional import join
 from eskf_ros.filter.output import status_of, write_odometry
-from eskf_ros.filter.recovery import is_near_gate, judge_filter, update_weighed_down, watch_solution
+from eskf_ros.filter.ranges import end_of_epoch, fuse_ranges, is_range, offer_signals
+from eskf_ros.filter.recovery import (
+    is_near_gate,
+    judge_filter,
+    judge_pressure,
+    update_weighed_down,
+    watch_solution,
+)
 from eskf_ros.filter.settings import intakes_from, settings_from
 from eskf_ros.filter.stillness import add_to_block, watch_wheels
 from eskf_ros.filter.strapdown import SECOND, propagate
@@ -57,7 +65,7 @@ from eskf_ros.filter.timeline import (
     forget,
     insert_aid,
     insert_imu,
-    is_duplicate,
+    open_record,
     raise_barrier,
     rewind,
     save_checkpoint,
@@ -65,6 +73,11 @@ from eskf_ros.filter.timeline import (
 )
 from eskf_ros.filter.update import update
 from eskf_ros.filter.warm_start import Memory, recall
+from eskf_ros.gnss.measurements import MEASURED_SIGNAL
+from eskf_ros.gnss.range_model import NO_KLOBUCHAR
+from eskf_ros.gnss.ranges import Status as RangeStatus
+from eskf_ros.gnss.ranges import status_counts
+from eskf_ros.gnss.time import SECONDS_PER_WEEK, Instant
 from eskf_ros.parameters import Parameters
 from eskf_ros.rotation import to_matrix
 
@@ -75,10 +88,11 @@ GNSS_POSITION = int(Stream.GNSS_POSITION)
 GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
 WHEEL = int(Stream.WHEEL)
 NHC = int(Stream.NHC)
+HEADING = int(Stream.HEADING)
+BARO = int(Stream.BARO)
 OPEN_DOOR = int(Verdict.WAITING)
 FIRST_CONSTRAINT = int(min(CONSTRAINTS))
 FUSED = int(Verdict.FUSED)
-DUPLICATE = int(Verdict.DUPLICATE)
 BEFORE_ALIGNMENT = int(Verdict.BEFORE_ALIGNMENT)
 INACTIVE = int(Verdict.INACTIVE)
 
@@ -89,6 +103,8 @@ IMU_BATCH = 1024
 
 HIGHEST_ALTITUDE = 1e5
 """What no receiver on a robot reports (m)."""
+
+DIAGONAL = np.eye(3).ravel()
 
 NO_STAND_IN = (0.0, 0.0, 0.0)
 """The covariance of a message is its own."""
@@ -109,8 +125,7 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
 
         while state.aid_next < t.aid_count and aids[state.aid_next].stamp < sample.stamp:
             predict(state, aids[state.aid_next].stamp, sample, settings, work)
-            fuse(state, aids, state.aid_next, settings, work)
-            state.aid_next += 1
+            state.aid_next = fuse_next(state, aids, t.aid_count, settings, work)
 
         previous_stamp = state.imu_stamp
         predict(state, sample.stamp, sample, settings, work)
@@ -125,8 +140,7 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
             carry(local, state, settings)
 
         while state.aid_next < t.aid_count and aids[state.aid_next].stamp == sample.stamp:
-            fuse(state, aids, state.aid_next, settings, work)
-            state.aid_next += 1
+            state.aid_next = fuse_next(state, aids, t.aid_count, settings, work)
 
         if is_new and is_on_grid(previous_stamp, sample.stamp, settings.output_interval):
             write_odometry(state, local, settings, rows[row_count])
@@ -164,28 +178,33 @@ def take_sample(state, sample):
 
 
 @njit
+def fuse_next(state, aids, count, settings, work):
+    """Offer the next of ``count`` measurements, signals by the epoch; return the index of the one that follows."""
+    i = state.aid_next
+    if not is_range(aids[i].stream):
+        fuse(state, aids, i, settings, work)
+        return i + 1
+    end = end_of_epoch(aids, i, count)
+    fuse_ranges(state, aids, i, end, settings, work)
+    return end
+
+
+@njit
 def fuse(state, aids, i, settings, work):
     """Offer one measurement to the state and leave the verdict in its record."""
+    if not open_record(aids, i):
+        return
     aid = aids[i]
-    aid.verdict = aid.door
-    aid.nis = np.nan
-    aid.dof = 0
-    for k in range(3):
-        aid.innovation[k] = np.nan
-    if aid.door != OPEN_DOOR:
-        return
-    if is_duplicate(aids, i):
-        aid.verdict = DUPLICATE
-        return
     if aid.stream == GNSS_POSITION:
         note_position(state, aid, settings)
     elif aid.stream == GNSS_VELOCITY:
         note_velocity(state, aid, settings)
+        watch_course(state, aid, heading_of(state, settings), settings)
     if not is_aligned_for(state, aid.stream):
         aid.verdict = BEFORE_ALIGNMENT if aid.stream < FIRST_CONSTRAINT else INACTIVE
         return
     position = (state.position_map[0], state.position_map[1], state.position_map[2])
-    heading = heading_of(state, settings)
+    heading_before = heading_of(state, settings)
     if state.position_known == 0 and aid.stream == GNSS_POSITION:
         start_position(state, aid.payload)
         recall_heading(state, aid.payload, settings)
@@ -196,6 +215,13 @@ def fuse(state, aids, i, settings, work):
     if size == 0:
         aid.verdict = INACTIVE
         return
+    if aid.stream == HEADING:
+        watch_heading(state, aid, work)
+        if state.heading_known == 0:
+            if not is_heading_told(state, aid, settings, work):
+                aid.verdict = BEFORE_ALIGNMENT
+                return
+            size = linearize(state, aid, settings, work)
     gate = settings.gate[aid.stream, size]
     for k in range(size):
         aid.innovation[k] = work.innovation[k]
@@ -210,7 +236,9 @@ def fuse(state, aids, i, settings, work):
         judge_filter(state, aid.verdict)
     elif aid.stream == WHEEL:
         watch_wheels(state, aid)
-    note_jump(state, position, heading, settings)
+    elif aid.stream == BARO:
+        judge_pressure(state, aid.verdict, settings)
+    note_jump(state, position, heading_before, settings)
 
 
 @njit
@@ -220,7 +248,7 @@ def is_aligned_for(state, stream):
         return False
     if stream == GNSS_POSITION:
         return True
-    if stream == GNSS_VELOCITY:
+    if stream in (GNSS_VELOCITY, HEADING, BARO):
         return state.position_known == 1
     return state.position_known == 1 and state.heading_known == 1
 
@@ -237,6 +265,10 @@ def linearize(state, aid, settings, work):
         return wheel.linearize(state, aid.payload, settings, work)
     if aid.stream == NHC:
         return nhc.linearize(state, settings, work)
+    if aid.stream == HEADING:
+        return heading.linearize(state, aid.payload, aid.source, settings, work)
+    if aid.stream == BARO:
+        return baro.linearize(state, aid.payload, aid.source, settings, work)
     return gnss_velocity.linearize(state, aid.payload, aid.source, settings, work)
 
 
@@ -292,6 +324,8 @@ class Navigator:
         self._refused_count: Counter[Stream] = Counter()
         self._stamp_difference: dict[Stream, float] = {}
         self._stand_ins = 0
+        self.range_statuses: Counter[RangeStatus] = Counter()
+        """What became of the signals before they entered the timeline: how many are usable, and why others are not."""
 
     def warm_start(self, memory: Memory, age: float) -> None:
         """Offer what an earlier run knew, ``age`` seconds ago; to be called before the first sample."""
@@ -454,6 +488,47 @@ class Navigator:
         self._take(stream, values, covariance)
         self._push_aid(stream, stamp + round(self._intakes[stream].time_offset * SECOND), arrival)
 
+    def push_ranges(
+        self,
+        stamp: int,
+        instant: Instant,
+        signals: np.ndarray,
+        klobuchar: FloatArray = NO_KLOBUCHAR,
+        arrival: int = 0,
+    ) -> None:
+        """Take the signals (MEASURED_SIGNAL, `gnss.measurements.measured_epoch`) of one epoch of the first receiver.
+
+        ``stamp``: the instant of the measurement on the IMU's clock; ``instant``: the same in GPS time, to a minute;
+        ``klobuchar``: eight parameters of the ionosphere. The signals have been measured without a position, so that
+        they do not depend on when they come.
+        """
+        self.range_statuses.update(status_counts(signals))
+        is_tight, ranges = self.parameters.mode == "tight", self.parameters.ranges
+        code_door = Verdict.WAITING if is_tight and ranges.use else Verdict.DISABLED
+        rate_door = Verdict.WAITING if is_tight and ranges.use_doppler else Verdict.DISABLED
+        stamp += round(ranges.time_offset * SECOND)
+        self._make_room(2 * len(signals))
+        refused = np.zeros(2 * len(signals), RECORD)
+        count = offer_signals(
+            self._aids,
+            self._timeline,
+            self._offered,
+            signals,
+            stamp,
+            arrival,
+            instant[0] * SECONDS_PER_WEEK + instant[1],
+            klobuchar,
+            int(code_door),
+            int(rate_door),
+            refused,
+        )
+        for stream in (Stream.PSEUDORANGE, Stream.RANGE_RATE):
+            self._offered_count[stream] += 1
+            if (refused["stream"][:count] == stream).any():
+                self._note_refused(stream, stamp)
+        if count:
+            self._refused.append(refused[:count])
+
     def take_records(self) -> np.ndarray:
         """Return the records (RECORD) that became final since the last call: in the total order, the too late last."""
         return self._take_records(False)
@@ -571,6 +646,8 @@ class Navigator:
         intake = self._intakes[stream]
         matrix = np.ascontiguousarray(covariance, np.float64)
         is_absent = not matrix.any() or (matrix[0] < 0.0 and not intake.may_lack_axes)
+        if intake.largest_variance < math.inf:
+            matrix = np.where((matrix > intake.largest_variance) & (DIAGONAL == 1.0), ABSENT, matrix)
         x, y, z = intake.unknown_std
         stand_in = (x * x, y * y, z * z) if is_absent else NO_STAND_IN
         self._admit(stream, (float(values[0]), float(values[1]), float(values[2])), matrix, stand_in)
@@ -589,7 +666,7 @@ class Navigator:
         aid = self._offered[0]
         if not intake.is_used:
             aid["door"] = Verdict.DISABLED
-        elif aid["door"] == Verdict.WAITING and max(map(abs, values)) > intake.largest:
+        elif aid["door"] == Verdict.WAITING and (max(map(abs, values)) > intake.largest or values[0] < intake.lowest):
             aid["door"] = Verdict.BAD_VALUE
         if aid["door"] == Verdict.WAITING and stand_in is not NO_STAND_IN:
             self._stand_ins += 1
@@ -600,6 +677,9 @@ class Navigator:
         second = self.parameters.second_gnss
         is_second = second.frame_id != "" and frame_id == second.frame_id
         offset = second.time_offset if is_second else self.parameters.gnss.time_offset
+        if self.parameters.mode == "tight" and not is_second:
+            # The fix is made of the same ranges: both together would count twice.
+            self._offered[0]["door"] = Verdict.DISABLED
         self._push_aid(stream, stamp + round(offset * SECOND), arrival, int(is_second))
 
     def _push_aid(self, stream: Stream, stamp: int, arrival: int, source: int = 0) -> None:
@@ -615,12 +695,15 @@ class Navigator:
 
     def _refuse(self, stream: Stream, stamp: int, arrival: int, source: int, verdict: Verdict) -> None:
         """Record a measurement that never enters the timeline."""
+        self._note_refused(stream, stamp)
+        record = (stamp, arrival, stream, source, verdict, 0, math.nan, (math.nan,) * 3)
+        self._refused.append(np.array([record], RECORD))
+
+    def _note_refused(self, stream: Stream, stamp: int) -> None:
         frontier = int(self._timeline["frontier"][0])
         if frontier != NEVER:
             self._refused_count[stream] += 1
             self._stamp_difference[stream] = (stamp - frontier) / SECOND
-        record = (stamp, arrival, stream, source, verdict, 0, math.nan, (math.nan,) * 3)
-        self._refused.append(np.array([record], RECORD))
 
     def _take_records(self, everything: bool) -> np.ndarray:
         records = allocate(RECORD, max(1, int(self._timeline["aid_count"][0] - self._timeline["recorded"][0])))
@@ -633,12 +716,12 @@ class Navigator:
         self.update()
         forget(self._states, self._imu, self._aids, self._checkpoints, self._timeline)
 
-    def _make_room(self) -> None:
-        """See that one batch of IMU samples with its checkpoints, and one aid, fit into the buffers."""
+    def _make_room(self, aids: int = 1) -> None:
+        """See that one batch of IMU samples with its checkpoints, and so many aids, fit into the buffers."""
         timeline = self._timeline
         checkpoints_needed = IMU_BATCH // CHECKPOINT_SPACING + 2
         # An interval between two samples has room for one grid point of the constraints.
-        aids_needed = 2 + IMU_BATCH * int(self._settings["constrains"].sum())
+        aids_needed = 1 + aids + IMU_BATCH * int(self._settings["constrains"].sum())
         if (
             len(self._imu) >= timeline["imu_count"][0] + IMU_BATCH
             and len(self._aids) >= timeline["aid_count"][0] + aids_needed
@@ -662,6 +745,7 @@ def compile_kernels() -> None:
     trial.push_imu(np.array([stamp]), np.array([[0.0, 0.0, 9.8]]), np.zeros((1, 3)))
     trial.push_gnss_position(stamp, *point, unit, 2, 0)
     trial.push_gnss_velocity(stamp, point, unit)
+    trial.push_ranges(stamp, (0, 0.0), np.zeros(1, MEASURED_SIGNAL))
     trial.take_records()
     trial.odometry  # noqa: B018 - asked for its side effect
     trial.status  # noqa: B018

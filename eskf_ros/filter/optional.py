@@ -37,6 +37,8 @@ def renew(state, place, count, settings):
 def wander(state, dt, settings):
     """Let ``dt`` s pass for the optional states: they decay towards zero and become less certain."""
     covariance = state.covariance
+    if settings.clock_at < state.error_size:
+        run_clock(state, settings.clock_at, dt, settings)
     for k in range(state.error_size - ERROR_SIZE):
         i = ERROR_SIZE + k
         if settings.optional_decay[k] > 0.0:
@@ -46,3 +48,22 @@ def wander(state, dt, settings):
                 covariance[i, j] *= remaining
                 covariance[j, i] *= remaining
         covariance[i, i] += settings.optional_noise_density[k] ** 2 * dt
+
+
+@njit
+def run_clock(state, place, dt, settings):
+    """Let ``dt`` s pass for the receiver's clock: the bias gains what the drift says, and what the drift gains.
+
+    Two-state clock (Brown and Hwang, Introduction to Random Signals and Applied Kalman Filtering, section 9.3); the
+    white noise of each of its two states is left to `wander`.
+    """
+    covariance = state.covariance
+    state.optional[place - ERROR_SIZE] += dt * state.optional[place + 1 - ERROR_SIZE]
+    for j in range(state.error_size):
+        covariance[place, j] += dt * covariance[place + 1, j]
+    for j in range(state.error_size):
+        covariance[j, place] += dt * covariance[j, place + 1]
+    density = settings.optional_noise_density[place + 1 - ERROR_SIZE] ** 2
+    covariance[place, place] += density * dt * dt * dt / 3.0
+    covariance[place, place + 1] += density * dt * dt / 2.0
+    covariance[place + 1, place] += density * dt * dt / 2.0

@@ -44,6 +44,18 @@ def watch_solution(state, aid, settings):
 
 
 @njit
+def judge_pressure(state, verdict, settings):
+    """Begin again with the offset of the barometer when what it says was outside the gate for long.
+
+    A door or a fan has changed the pressure for good: it says nothing of the height, but soon again of its changes.
+    """
+    if verdict == GATE and state.stamp - state.baro_stamp > REJECTED_TIME:
+        renew(state, settings.baro_offset_at, 1, settings)
+    if verdict == FUSED:
+        state.baro_stamp = state.stamp
+
+
+@njit
 def is_near_gate(verdict, nis, gate):
     """Say whether a rejected fix is close enough to the gate to be weighed down instead."""
     return verdict == GATE and nis <= NEAR_GATE * gate

@@ -3,24 +3,48 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 from scipy.special import chdtri
 
-from eskf_ros.filter.layout import CONSTRAINTS, ERROR_SIZE, NOWHERE, OPTIONAL_SIZES, SETTINGS, Stream, allocate
+from eskf_ros.filter.layout import (
+    CONSTRAINTS,
+    ERROR_SIZE,
+    INTER_SYSTEM,
+    NOWHERE,
+    OPTIONAL_SIZES,
+    SETTINGS,
+    Stream,
+    allocate,
+)
 from eskf_ros.filter.strapdown import SECOND
+from eskf_ros.gnss.signals import Gnss
 from eskf_ros.parameters import Aid, Parameters
 from eskf_ros.rotation import from_roll_pitch_yaw, to_matrix
 
 Axes = tuple[float, float, float]
+FloatArray = npt.NDArray[np.float64]
 
 HIGHEST_SPEED = 600.0
 STRONGEST_FIELD = 1.0
 HIGHEST_PRESSURE = 1.2e5
 """What no sensor on a robot reports (m/s, T, Pa)."""
 
+LOWEST_PRESSURE = 1.0e4
+"""That at 16 km (Pa); a driver that reports hectopascal is below it."""
+
+LARGEST_ANGLE = 2.0 * math.pi
+UNKNOWN_ANGLE_VARIANCE = 1.0
+"""Angles are in rad; drivers say with a variance like 1000 or pi^2 that they do not know one (rad2)."""
+
 CONSTRAINT_GATE_PROBABILITY = 0.999
+
+START_CLOCK_STD = (1000.0, 1000.0)
+"""Of a receiver clock (m, m/s) whose first value is the median of the satellites."""
+
+Deviation = float | tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -28,8 +52,8 @@ class Intake:
     """How the messages of a stream are taken in.
 
     ``std_floor`` and ``unknown_std`` per axis, in the unit of the values; the latter stands in for a covariance that is
-    not there. No message with a value beyond ``largest`` can be true. ``may_lack_axes``: a negative variance says that
-    the axis was not measured.
+    not there. No message with a value beyond ``largest`` can be true. ``may_lack_axes``: a negative variance, or one
+    above ``largest_variance``, says that the axis was not measured. The first value is never below ``lowest``.
     """
 
     is_used: bool
@@ -39,10 +63,18 @@ class Intake:
     unknown_std: Axes
     largest: float
     may_lack_axes: bool = False
+    largest_variance: float = math.inf
+    lowest: float = -math.inf
 
 
 def _threefold(value: float) -> Axes:
     return (value, value, value)
+
+
+def _matrix(rpy_deg: tuple[float, ...]) -> FloatArray:
+    """Return the rotation to base_link from the axes of a sensor that is mounted like this."""
+    roll, pitch, yaw = (math.radians(angle) for angle in rpy_deg)
+    return np.array(to_matrix(from_roll_pitch_yaw(roll, pitch, yaw)))
 
 
 def intakes_from(parameters: Parameters) -> dict[Stream, Intake]:
@@ -72,10 +104,18 @@ def intakes_from(parameters: Parameters) -> dict[Stream, Intake]:
         parameters.baro,
     )
 
-    def aid(group: Aid, floor: Axes, unknown: Axes, largest: float, lacks: bool) -> Intake:
-        return Intake(group.use, group.time_offset, group.covariance_scale, floor, unknown, largest, lacks)
+    def aid(
+        group: Aid, floor: Axes, unknown: Axes, largest: float, lacks: bool, largest_variance: float = math.inf
+    ) -> Intake:
+        return Intake(
+            group.use, group.time_offset, group.covariance_scale, floor, unknown, largest, lacks, largest_variance
+        )
 
-    heading_std = _threefold(math.radians(heading.std_floor_deg)), _threefold(math.radians(heading.unknown_std_deg))
+    # A message without a covariance says nothing of the pitch.
+    heading_std = (
+        _threefold(math.radians(heading.std_floor_deg)),
+        (math.radians(heading.unknown_std_deg), math.nan, math.nan),
+    )
     wheel_std = (
         (wheel.speed_std_floor, wheel.yaw_rate_std_floor, 1.0),
         (wheel.unknown_speed_std, wheel.unknown_yaw_rate_std, 1.0),
@@ -83,11 +123,14 @@ def intakes_from(parameters: Parameters) -> dict[Stream, Intake]:
     return {
         Stream.GNSS_POSITION: position,
         Stream.GNSS_VELOCITY: velocity,
-        Stream.HEADING: aid(heading, *heading_std, 10.0, True),
+        Stream.HEADING: aid(heading, *heading_std, LARGEST_ANGLE, True, UNKNOWN_ANGLE_VARIANCE),
         Stream.MAG: aid(mag, _threefold(mag.std_floor), _threefold(mag.unknown_std), STRONGEST_FIELD, False),
         Stream.WHEEL: aid(wheel, *wheel_std, HIGHEST_SPEED, True),
         Stream.BODY_VELOCITY: aid(body, _threefold(body.std_floor), _threefold(body.unknown_std), HIGHEST_SPEED, True),
-        Stream.BARO: aid(baro, _threefold(baro.std_floor), _threefold(baro.unknown_std), HIGHEST_PRESSURE, True),
+        Stream.BARO: replace(
+            aid(baro, _threefold(baro.std_floor), _threefold(baro.unknown_std), HIGHEST_PRESSURE, True),
+            lowest=LOWEST_PRESSURE,
+        ),
     }
 
 
@@ -101,6 +144,7 @@ def gate_probabilities(parameters: Parameters) -> dict[Stream, float]:
         Stream.WHEEL: parameters.wheel.gate_probability,
         Stream.BODY_VELOCITY: parameters.body_velocity.gate_probability,
         Stream.BARO: parameters.baro.gate_probability,
+        **dict.fromkeys((Stream.PSEUDORANGE, Stream.RANGE_RATE), parameters.ranges.gate_probability),
         **dict.fromkeys(CONSTRAINTS, CONSTRAINT_GATE_PROBABILITY),
     }
 
@@ -121,18 +165,24 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
     settings["imu_gap"] = imu.gap
     settings["gap_accel_std"] = imu.gap_accel_std
     settings["gap_gyro_std"] = imu.gap_gyro_std
-    roll, pitch, yaw = (math.radians(angle) for angle in imu.mount_rpy_deg)
-    imu_to_base = np.array(to_matrix(from_roll_pitch_yaw(roll, pitch, yaw)))
+    imu_to_base = _matrix(imu.mount_rpy_deg)
     settings["imu_to_base"] = imu_to_base
     settings["imu_position_base"] = imu.mount_position
     lever_arms_base = np.subtract([parameters.gnss.lever_arm, parameters.second_gnss.lever_arm], imu.mount_position)
     settings["lever_arms_body"] = lever_arms_base @ imu_to_base
+    baseline = _matrix(parameters.heading.mount_rpy_deg)[:, 0]
+    settings["heading_lines_body"] = np.array([baseline, (1.0, 0.0, 0.0)]) @ imu_to_base
+    settings["baro_arm_body"] = np.subtract(parameters.baro.position, imu.mount_position) @ imu_to_base
     for stream, probability in gate_probabilities(parameters).items():
         settings["gate"][0, stream, 1:] = chdtri([1, 2, 3], 1.0 - probability)
     settings["constrains"][0, Stream.ZUPT] = settings["constrains"][0, Stream.ZARU] = parameters.zupt.enabled
     settings["constrains"][0, Stream.NHC] = parameters.nhc.enabled
     settings["correlated_share"] = parameters.gnss.correlated_share
     describe_vehicle(settings[0], parameters)
+    settings["elevation_mask"] = math.radians(parameters.ranges.elevation_mask_deg)
+    settings["range_covariance_scale"] = parameters.ranges.covariance_scale
+    settings["code_std_floor"] = parameters.ranges.code_std_floor
+    settings["range_rate_std_floor"] = parameters.ranges.range_rate_std_floor
     place_optional_states(settings[0], parameters)
     settings["static_duration"] = alignment.static_duration
     settings["moving_start_after"] = alignment.moving_start_after
@@ -164,17 +214,27 @@ def describe_vehicle(settings: np.void, parameters: Parameters) -> None:
 
 
 def place_optional_states(settings: np.void, parameters: Parameters) -> None:
-    """Give the optional states that are switched on their places and their models, and the streams their reach."""
+    """Give the optional states that are switched on their places and their models, and the streams their reach.
+
+    The offsets of the constellations join one by one, with the first signal of each (`ranges`).
+    """
     settings["reach"] = end = ERROR_SIZE
-    time = parameters.gnss.correlation_time
+    time, baro = parameters.gnss.correlation_time, parameters.baro
     estimate = parameters.estimate
     mounting_std, mounting_walk = math.radians(estimate.mounting_std_deg), estimate.mounting_random_walk
     scale_std, scale_walk = estimate.wheel_scale_std, estimate.wheel_scale_random_walk
+    ranges, is_tight = parameters.ranges, parameters.mode == "tight"
+    clock_noise = (ranges.clock_bias_noise, ranges.clock_drift_noise)
     # Name, whether it is on, first deviation, driving noise, correlation time (0: random walk), streams that need it.
-    blocks: tuple[tuple[str, bool, float, float, float, tuple[Stream, ...]], ...] = (
+    blocks: tuple[tuple[str, bool, Deviation, Deviation, float, tuple[Stream, ...]], ...] = (
         ("position_error", time > 0.0, 1.0, math.sqrt(2.0 / time) if time else 0.0, time, (Stream.GNSS_POSITION,)),
         ("mounting", estimate.mounting, mounting_std, mounting_walk, 0.0, (Stream.NHC, Stream.WHEEL)),
         ("wheel_scale", estimate.wheel_scale, scale_std, scale_walk, 0.0, (Stream.WHEEL,)),
+        # Not by whether it is used, which may change while running: places stay.
+        ("baro_offset", True, baro.offset_std, baro.offset_random_walk, 0.0, (Stream.BARO,)),
+        ("baro_scale", True, baro.scale_std, 0.0, 0.0, (Stream.BARO,)),
+        ("clock", is_tight, START_CLOCK_STD, clock_noise, 0.0, (Stream.PSEUDORANGE, Stream.RANGE_RATE)),
+        ("inter_system", is_tight, inter_system_stds(parameters), ranges.inter_system_noise, 0.0, ()),
     )
     for name, is_on, std, noise_density, time, streams in blocks:
         settings[f"{name}_at"] = end if is_on else NOWHERE
@@ -187,3 +247,12 @@ def place_optional_states(settings: np.void, parameters: Parameters) -> None:
         end += OPTIONAL_SIZES[name]
         for stream in streams:
             settings["reach"][stream] = end
+
+
+def inter_system_stds(parameters: Parameters) -> tuple[float, ...]:
+    """Return the standard deviation (m) of each of the `INTER_SYSTEM` offsets at first."""
+    ranges = parameters.ranges
+    return tuple(
+        ranges.inter_system_std_glonass if system == Gnss.GLONASS else ranges.inter_system_std
+        for system in INTER_SYSTEM
+    )

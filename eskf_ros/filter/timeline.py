@@ -22,6 +22,7 @@ from eskf_ros.filter.layout import CONSTRAINT_INTERVAL, CONSTRAINTS, NEVER, Verd
 
 WAITING = int(Verdict.WAITING)
 BAD_STAMP = int(Verdict.BAD_STAMP)
+DUPLICATE = int(Verdict.DUPLICATE)
 BEFORE_ALIGNMENT = int(Verdict.BEFORE_ALIGNMENT)
 OUTSIDE_HISTORY = int(Verdict.OUTSIDE_HISTORY)
 INACTIVE = int(Verdict.INACTIVE)
@@ -302,6 +303,23 @@ def is_duplicate(aids, i):
     aid, other = aids[i], aids[i - 1]
     is_same = other.stamp == aid.stamp and other.stream == aid.stream and other.source == aid.source
     return is_same and other.door == 0
+
+
+@njit
+def open_record(aids, i):
+    """Begin anew with the record of a measurement; say whether it may be offered to the state."""
+    aid = aids[i]
+    aid.verdict = aid.door
+    aid.nis = math.nan
+    aid.dof = 0
+    for k in range(3):
+        aid.innovation[k] = math.nan
+    if aid.door != WAITING:
+        return False
+    if is_duplicate(aids, i):
+        aid.verdict = DUPLICATE
+        return False
+    return True
 
 
 @njit

@@ -46,9 +46,10 @@ class Timing:
 class StampMonitor:
     """The stamps of one topic. All times are integer nanoseconds; arrivals are of the node's clock."""
 
-    def __init__(self, topic: str, window: float = 2.0) -> None:
-        """`window` (s): how far out of order stamps may be; the history window of the filter."""
+    def __init__(self, topic: str, window: float = 2.0, sender: str = "") -> None:
+        """`window` (s): how far out of order stamps may be; the history window of the filter. `sender`: of several."""
         self.topic = topic
+        self.label = f"{topic} from {sender}" if sender else topic
         self.zero_count = 0
         self.zero_run = 0
         self.restart_count = 0
@@ -130,12 +131,12 @@ def clock_complaints(monitors: Iterable[StampMonitor], now: int, tolerance: floa
     for monitor in monitors:
         if monitor.zero_run:
             found.append(
-                f"{monitor.zero_count} {'message' if monitor.zero_count == 1 else 'messages'} on {monitor.topic} "
+                f"{monitor.zero_count} {'message' if monitor.zero_count == 1 else 'messages'} on {monitor.label} "
                 "with stamp zero: the driver must fill in header.stamp; without it a measurement has no place in time"
             )
         delay = monitor.timing(now).delay
         if not math.isnan(delay):
-            delays.append((delay, monitor.topic))
+            delays.append((delay, monitor.label))
     if delays:
         (least, quickest), (most, slowest) = min(delays), max(delays)
         if most - least > tolerance:

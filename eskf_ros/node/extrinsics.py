@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,24 +14,53 @@ from eskf_ros.parameters import Parameters, to_mapping
 Pose = tuple[np.ndarray, Rotation]
 """Position (3,) m and orientation of a frame in another."""
 
-IMU = "imu"
-ANTENNA = "GNSS antenna"
-PARAMETERS = {IMU: ("imu.mount_position", "imu.mount_rpy_deg"), ANTENNA: ("gnss.lever_arm",)}
-"""What tells the place of each sensor."""
+IMU, ANTENNA, SECOND_ANTENNA = "IMU", "GNSS antenna", "second GNSS antenna"
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a sensor sits: parameters of its position and orientation (empty: of no account), inputs that name it."""
+
+    position: str
+    rotation: str = ""
+    inputs: tuple[str, ...] = ()
+
+
+PLACES = {
+    IMU: Place("imu.mount_position", "imu.mount_rpy_deg"),
+    ANTENNA: Place("gnss.lever_arm", inputs=("gnss_fix", "gnss_velocity")),
+    SECOND_ANTENNA: Place("second_gnss.lever_arm"),
+}
+"""One row for each sensor whose place in base_link counts."""
+
+
+def place_of(name: str, receiver: int = 0) -> str:
+    """The sensor of the input with this name; empty where its place is of no account."""
+    if receiver:
+        return SECOND_ANTENNA
+    return next((sensor for sensor, place in PLACES.items() if name in place.inputs), "")
 
 
 class Extrinsics:
     """Collects static transforms and the frames of the sensors, and completes the parameters with what they tell.
 
     Reading is a matter of the first messages: afterwards nothing changes, and nothing is looked up any more.
+
+    Attributes:
+        sensors: those this robot has.
     """
 
     def __init__(self, parameters: Parameters) -> None:
         """`parameters` as somebody gave them: what is not zero there is not looked up."""
         self._base_link = parameters.frames.base_link
         values = to_mapping(parameters)
-        use_tf = parameters.frames.extrinsics == "auto"
-        self._wanted = {s for s, names in PARAMETERS.items() if use_tf and not np.any([values[n] for n in names])}
+        self.sensors = [s for s in PLACES if s != SECOND_ANTENNA or parameters.second_gnss.frame_id]
+        self._wanted: set[str] = set()
+        if parameters.frames.extrinsics == "auto":
+            for sensor in self.sensors:
+                names = (PLACES[sensor].position, PLACES[sensor].rotation)
+                if not np.any([values[name] for name in names if name]):
+                    self._wanted.add(sensor)
         self._parents: dict[str, tuple[str, Pose]] = {}
         self._frames: dict[str, list[str]] = {}
         self._found: dict[str, Pose] = {}
@@ -68,16 +98,10 @@ class Extrinsics:
 
     def completed(self, parameters: Parameters) -> Parameters:
         """The parameters with the places that were found."""
-        if IMU in self._found:
-            position, rotation = self._found[IMU]
-            angles = rotation.as_euler("xyz", degrees=True)
-            imu = dataclasses.replace(
-                parameters.imu, mount_position=tuple(position.tolist()), mount_rpy_deg=tuple(angles.tolist())
-            )
-            parameters = dataclasses.replace(parameters, imu=imu)
-        if ANTENNA in self._found:
-            gnss = dataclasses.replace(parameters.gnss, lever_arm=tuple(self._found[ANTENNA][0].tolist()))
-            parameters = dataclasses.replace(parameters, gnss=gnss)
+        for sensor, (position, rotation) in self._found.items():
+            parameters = _changed(parameters, PLACES[sensor].position, position)
+            if PLACES[sensor].rotation:
+                parameters = _changed(parameters, PLACES[sensor].rotation, rotation.as_euler("xyz", degrees=True))
         return parameters
 
     def source_of(self, sensor: str) -> str:
@@ -106,3 +130,9 @@ class Extrinsics:
             pose = position + rotation.apply(pose[0]), rotation * pose[1]
             found[frame] = pose
         return found
+
+
+def _changed(parameters: Parameters, name: str, values: np.ndarray) -> Parameters:
+    group, field = name.split(".")
+    changed = dataclasses.replace(getattr(parameters, group), **{field: tuple(values.tolist())})
+    return dataclasses.replace(parameters, **{group: changed})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,13 @@ from std_srvs.srv import Trigger
 from eskf_ros.filter.layout import Status, Verdict
 from eskf_ros.filter.navigator import Navigator, compile_kernels
 from eskf_ros.filter.warm_start import Memory
+from eskf_ros.inputs import Input
 from eskf_ros.node import robot_localization, transforms
 from eskf_ros.node.cdr import ImuReader, ImuSample, imu_from_message
 from eskf_ros.node.clocks import SECOND, Stamp, StampMonitor
 from eskf_ros.node.declare import LiveParameters, declare, unused_overrides
-from eskf_ros.node.extrinsics import ANTENNA, IMU, Extrinsics
+from eskf_ros.node.extrinsics import IMU, Extrinsics, place_of
+from eskf_ros.node.inputs import AidInput, open_inputs
 from eskf_ros.node.memory import read_memory, write_memory
 from eskf_ros.node.messages import bias_message, fix_message, record_statuses
 from eskf_ros.node.outputs import OUTPUT_QOS, OVERRIDING, Outputs
@@ -34,7 +37,6 @@ from eskf_ros.parameters import Parameters
 INPUT_DEPTH = 1000
 """A second of a fast IMU: what may wait while the computer is busy elsewhere."""
 
-GNSS_DEPTH = 50
 REPORT_PERIOD = 1.0
 
 WATCH_EVERY = 10
@@ -42,7 +44,7 @@ WATCH_EVERY = 10
 
 
 class EskfNode(Node):
-    """Subscribes to IMU and GNSS, publishes odometry for every IMU sample, diagnostics and biases once a second.
+    """Subscribes to the IMU and its aids; publishes odometry for every IMU sample, diagnostics once a second.
 
     A message that cannot be used is counted and named in the diagnostics; it never ends the node.
     """
@@ -56,7 +58,8 @@ class EskfNode(Node):
         self.resets = 0
         self.longest_callback = 0.0
         self.extrinsics = Extrinsics(self.parameters)
-        self._frames_met: set[tuple[str, str | bytes]] = set()
+        self._frames_met: set[tuple[str, str]] = set()
+        self._imu_frames_met: set[bytes] = set()
         self._is_judging = False
         self._is_simulated = bool(self.get_parameter("use_sim_time").value)
         self._reports = 0
@@ -71,19 +74,16 @@ class EskfNode(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", OUTPUT_QOS)
 
         self._imu_reader = ImuReader()
-        topics, window = self.parameters.topics, self.parameters.history.window
-        self.monitors: dict[str, StampMonitor] = {}
-        self.inputs = {}
-        for kind, topic, callback, depth in (
-            (Imu, topics.imu, self._on_imu, INPUT_DEPTH),
-            (NavSatFix, topics.gnss_fix, self._on_fix, GNSS_DEPTH),
-            (TwistWithCovarianceStamped, topics.gnss_velocity, self._on_velocity, GNSS_DEPTH),
-        ):
-            self.monitors[topic] = StampMonitor(self.resolve_topic_name(topic), window)
-            # All come serialised: a message that cannot be read fails in our callback, not in the executor.
-            self.inputs[topic] = self.create_subscription(
-                kind, topic, self._contained(callback), input_qos(depth), raw=True, qos_overriding_options=OVERRIDING
-            )
+        topic = self.parameters.topics.imu
+        self.imu_monitor = StampMonitor(self.resolve_topic_name(topic), self.parameters.history.window)
+        self.aid_inputs = open_inputs(self.parameters, self.resolve_topic_name)
+        self.inputs: list[tuple[Any, Input | None]] = [
+            (self._subscribe(Imu, topic, INPUT_DEPTH, self._on_imu, "imu"), None)
+        ]
+        for source in self.aid_inputs:
+            kind, callback = source.kind, partial(self._on_aid, source, source.kind.push_of(self.navigator))
+            subscription = self._subscribe(source.message_class, source.name, kind.depth, callback, kind.name)
+            self.inputs.append((subscription, kind))
         self._transform_input: Any = None
         self._open_transform_inputs()
         self.create_service(Trigger, "~/reset", self._served(self._on_reset))
@@ -91,15 +91,21 @@ class EskfNode(Node):
         if robot_localization.services is not None:
             robot_localization.RobotLocalizationServices(self, self.navigator)
         # Not on the clock of the node: a simulation that has not begun is worth a report too.
-        self.create_timer(REPORT_PERIOD, self._contained(self._report), clock=Clock(clock_type=ClockType.STEADY_TIME))
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(REPORT_PERIOD, self._contained(self._report, "report"), clock=steady)
         for name in unused_overrides(self):
             self.get_logger().warn(f"parameter {name} belongs to nothing here and has no effect")
-        self.get_logger().info("ready: waiting for " + ", ".join(m.topic for m in self.monitors.values()))
+        self.get_logger().info("ready: listening to " + ", ".join(monitor.label for monitor in self.monitors))
+
+    @property
+    def monitors(self) -> list[StampMonitor]:
+        """What watches the stamps of the inputs, that of the IMU first."""
+        return [self.imu_monitor, *(monitor for source in self.aid_inputs for monitor in source.monitors)]
 
     def close(self) -> None:
         """Publish the last report and write the warm start file; called while the publishers still work."""
-        self._contained(self._report)()
-        self._contained(self._write_memory)()
+        self._contained(self._report, "report")()
+        self._contained(self._write_memory, "warm_start.file")()
 
     def note_trouble(self, text: str) -> None:
         """Count a kind of trouble, and log it the first time."""
@@ -115,14 +121,20 @@ class EskfNode(Node):
         compile_kernels()
         fix_message(self.navigator.odometry[0], (0.0, 0.0, 0.0), "")
 
-    def _contained(self, callback: Callable[..., None]) -> Callable[..., None]:
-        """Let no message and no mistake of ours end the node: count it, log it, go on."""
+    def _subscribe(self, kind: Any, topic: str, depth: int, callback: Callable[..., None], name: str) -> Any:
+        # All come serialised: a message that cannot be read fails in our callback, not in the executor.
+        return self.create_subscription(
+            kind, topic, self._contained(callback, name), input_qos(depth), raw=True, qos_overriding_options=OVERRIDING
+        )
+
+    def _contained(self, callback: Callable[..., None], name: str) -> Callable[..., None]:
+        """Let no message and no mistake of ours end the node: count it by name, log it, go on."""
 
         def contain(*arguments: Any) -> None:
             try:
                 callback(*arguments)
             except Exception as error:
-                self.note_trouble(f"{callback.__name__.removeprefix('_on_')}: {type(error).__name__}: {error}")
+                self.note_trouble(f"{name}: {type(error).__name__}: {error}")
 
         return contain
 
@@ -141,28 +153,19 @@ class EskfNode(Node):
     def _configure(self, parameters: Parameters) -> None:
         self.parameters = self.extrinsics.completed(parameters)
         self.navigator.configure(self.parameters)
+        for source in self.aid_inputs:
+            source.configure(self.parameters)
 
     def _now(self) -> int:
         # The clock of the node costs more than the filter; without simulated time it is the system's.
         return int(self.get_clock().now().nanoseconds) if self._is_simulated else time.time_ns()
 
-    def _is_usable(self, topic: str, stamp: int, frame: str | bytes) -> bool:
-        """Note stamp (ns) and frame of a message; False if it has no place in time."""
-        is_aid = topic != self.parameters.topics.imu
-        offset = round(self.parameters.gnss.time_offset * SECOND) if is_aid and stamp else 0
-        judgement = self.monitors[topic].note(stamp + offset, self._now())
-        if judgement == Stamp.STARTED_AGAIN and not is_aid:
-            self._reset(f"the stamps of {self.monitors[topic].topic} went back")
-        if (topic, frame) not in self._frames_met:
-            self._meet_frame(topic, frame)
-        return judgement != Stamp.ZERO
-
     def _reset(self, why: str) -> None:
         self.get_logger().warn(f"{why}: the estimator starts again")
         self.navigator.reset()
         self.resets += 1
-        for topic, monitor in self.monitors.items():
-            if topic != self.parameters.topics.imu:
+        for source in self.aid_inputs:
+            for monitor in source.monitors:
                 monitor.restart()
 
     def _on_imu(self, data: bytes) -> None:
@@ -171,7 +174,12 @@ class EskfNode(Node):
         if sample is None:
             sample = imu_from_message(deserialize_message(data, Imu))
         stamp, specific_force, angular_rate, frame = sample
-        if not self._is_usable(self.parameters.topics.imu, stamp, frame):
+        judgement = self.imu_monitor.note(stamp, self._now())
+        if judgement == Stamp.STARTED_AGAIN:
+            self._reset(f"the stamps of {self.imu_monitor.topic} went back")
+        if frame not in self._imu_frames_met:
+            self._meet_frame(self._imu_frames_met, frame, IMU, frame.decode(errors="replace"))
+        if judgement == Stamp.ZERO:
             return
         if self._memory is not None:
             self._offer_memory(stamp)
@@ -182,31 +190,19 @@ class EskfNode(Node):
             self._tell_verdicts()
         self.longest_callback = max(self.longest_callback, time.perf_counter() - started)
 
-    def _on_fix(self, data: bytes) -> None:
-        message: NavSatFix = deserialize_message(data, NavSatFix)
-        header = message.header
-        stamp = header.stamp.sec * SECOND + header.stamp.nanosec
-        if self._is_usable(self.parameters.topics.gnss_fix, stamp, header.frame_id):
-            self.navigator.push_gnss_position(
-                stamp,
-                message.latitude,
-                message.longitude,
-                message.altitude,
-                message.position_covariance,
-                message.position_covariance_type,
-                message.status.status,
-                self._now(),
-            )
-            self._is_judging = True
-
-    def _on_velocity(self, data: bytes) -> None:
-        message: TwistWithCovarianceStamped = deserialize_message(data, TwistWithCovarianceStamped)
-        header = message.header
-        stamp = header.stamp.sec * SECOND + header.stamp.nanosec
-        if self._is_usable(self.parameters.topics.gnss_velocity, stamp, header.frame_id):
-            linear = message.twist.twist.linear
-            covariance = np.reshape(message.twist.covariance, (6, 6))[:3, :3].ravel()
-            self.navigator.push_gnss_velocity(stamp, (linear.x, linear.y, linear.z), covariance, self._now())
+    def _on_aid(self, source: AidInput, push: Callable[..., None], data: bytes) -> None:
+        arrival = self._now()
+        batch = source.read(data, arrival)
+        frame = batch.strings[int(batch.messages["frame_id"][0])]
+        receiver = source.receiver(frame)
+        if (source.kind.name, frame) not in self._frames_met:
+            place = place_of(source.kind.name, receiver)
+            self._meet_frame(self._frames_met, (source.kind.name, frame), place, frame)
+        stamp = int(batch.messages["stamp"][0])
+        if source.monitors[receiver].note(stamp and stamp + source.offset(receiver), arrival) == Stamp.ZERO:
+            return
+        for arguments in source.arguments(batch):
+            push(*arguments)
             self._is_judging = True
 
     def _tell_verdicts(self) -> None:
@@ -254,16 +250,15 @@ class EskfNode(Node):
             return
         if self.parameters.frames.extrinsics == "auto":
             latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-            self.create_subscription(
-                transforms.TFMessage, "/tf_static", self._contained(self._on_static_transforms), latched
-            )
+            callback = self._contained(self._on_static_transforms, "/tf_static")
+            self.create_subscription(transforms.TFMessage, "/tf_static", callback, latched)
         if self.parameters.output.tf == "map_to_odom":
             self._listen_to_transforms()
 
     def _listen_to_transforms(self) -> None:
         assert self.outputs.transforms is not None
         self._transform_input = self.create_subscription(
-            transforms.TFMessage, "/tf", self._contained(self.outputs.transforms.receive), INPUT_DEPTH
+            transforms.TFMessage, "/tf", self._contained(self.outputs.transforms.receive, "/tf"), INPUT_DEPTH
         )
 
     def _watch_transforms(self) -> None:
@@ -288,14 +283,14 @@ class EskfNode(Node):
             self.extrinsics.note_transform(transform)
         self._complete_extrinsics()
 
-    def _meet_frame(self, topic: str, frame: str | bytes) -> None:
-        """Take note of a frame name that a topic has not used before."""
-        if len(self._frames_met) > 100:
+    def _meet_frame(self, met: set[Any], key: object, place: str, frame: str) -> None:
+        """Take note of a frame name that an input has not used before."""
+        if len(met) > 100:
             return
-        self._frames_met.add((topic, frame))
-        sensor = IMU if topic == self.parameters.topics.imu else ANTENNA
-        self.extrinsics.note_frame(sensor, frame.decode(errors="replace") if isinstance(frame, bytes) else frame)
-        self._complete_extrinsics()
+        met.add(key)
+        if place:
+            self.extrinsics.note_frame(place, frame)
+            self._complete_extrinsics()
 
     def _complete_extrinsics(self) -> None:
         found = self.extrinsics.find()

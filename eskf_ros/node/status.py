@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,9 +12,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from eskf_ros.filter.layout import STREAM_NAMES, Status
-from eskf_ros.node.clocks import clock_complaints
-from eskf_ros.node.extrinsics import ANTENNA, IMU
+from eskf_ros.filter.layout import STREAM_NAMES, Status, Stream
+from eskf_ros.node.clocks import StampMonitor, clock_complaints
 from eskf_ros.node.messages import key_values
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ def status_report(node: EskfNode, stamp: Time) -> DiagnosticArray:
     now = node.get_clock().now().nanoseconds
     row = node.navigator.odometry[0]
     status = Status(int(row["status"]))
-    problems = [*node.navigator.complaints, *clock_complaints(node.monitors.values(), now)]
+    problems = [*node.navigator.complaints, *clock_complaints(node.monitors, now)]
     problems += [*mismatches(node), *second_publishers(node)]
     problems += [f"{text} ({count} times)" for text, count in node.trouble.items()]
     waiting = waiting_for(node, status, now)
@@ -54,41 +54,43 @@ def status_report(node: EskfNode, stamp: Time) -> DiagnosticArray:
 
 def waiting_for(node: EskfNode, status: Status, now: int) -> list[str]:
     """What keeps the state from the next rung."""
-    names = node.parameters.topics
+    fixes = next(source for source in node.aid_inputs if source.kind.stream == Stream.GNSS_POSITION).monitors
     if status in (Status.WAITING_IMU, Status.LEVELLING):
-        return missing(node, names.imu, now) or ["standing still or driving steadily for a moment"]
+        return missing(node, [node.imu_monitor], now) or ["standing still or driving steadily for a moment"]
     if status == Status.FAULT:
         return ["a reset: call the service ~/reset"]
     if status == Status.DEGRADED:
         return ["fixes that agree with the estimate: see eskf/aids"]
     if status in (Status.WAITING_FIX, Status.COASTING):
-        return missing(node, names.gnss_fix, now) or ["fixes come, but none was accepted lately: see eskf/aids"]
+        return missing(node, fixes, now) or ["fixes come, but none was accepted lately: see eskf/aids"]
     if status == Status.WAITING_HEADING:
         way = "speeding up, braking or turning tells the heading, a constant velocity does not"
-        return missing(node, names.gnss_fix, now) or [way]
+        return missing(node, fixes, now) or [way]
     return []
 
 
-def missing(node: EskfNode, name: str, now: int) -> list[str]:
-    """Say so when nothing comes on a topic, and who could send."""
-    monitor = node.monitors[name]
-    timing = monitor.timing(now)
-    if timing.silence <= SILENCE:
+def missing(node: EskfNode, monitors: Sequence[StampMonitor], now: int) -> list[str]:
+    """Say so when nothing comes on a topic, from any of those watched on it, and who could send."""
+    silences = [silence for monitor in monitors if not math.isnan(silence := monitor.timing(now).silence)]
+    if silences and min(silences) <= SILENCE:
         return []
-    publishers = node.count_publishers(monitor.topic)
-    since = "no message" if math.isnan(timing.silence) else f"no message for {timing.silence:.0f} s"
-    return [f"{since} on {monitor.topic}; {publishers} publisher{'' if publishers == 1 else 's'}"]
+    topic = monitors[0].topic
+    publishers = node.count_publishers(topic)
+    since = f"no message for {min(silences):.0f} s" if silences else "no message"
+    return [f"{since} on {topic}; {publishers} publisher{'' if publishers == 1 else 's'}"]
 
 
 def mismatches(node: EskfNode) -> list[str]:
     """Publishers whose messages cannot reach us, and subscribers that ours cannot reach: type or quality of service."""
     found = []
-    for subscription in node.inputs.values():
-        wanted = subscription.qos_profile
+    for subscription, kind in node.inputs:
+        wanted, expected = subscription.qos_profile, type_name(subscription.msg_type)
         for other in node.get_publishers_info_by_topic(subscription.topic_name):
             reason = ""
-            if other.topic_type != type_name(subscription.msg_type):
-                reason = f"sends {other.topic_type}, {type_name(subscription.msg_type)} is expected"
+            if other.topic_type != expected:
+                reason = f"sends {other.topic_type}, {expected} is expected"
+                if kind is not None and other.topic_type in kind.types:
+                    reason += f" unless topics.{kind.name}_type says otherwise"
             elif wanted.reliability == RELIABLE and other.qos_profile.reliability == BEST_EFFORT:
                 reason = "is best effort, this node was told to ask for reliable (qos_overrides)"
             elif wanted.durability == TRANSIENT_LOCAL and other.qos_profile.durability == VOLATILE:
@@ -148,8 +150,7 @@ def figures(node: EskfNode, row: np.void) -> dict[str, object]:
         "window needed (s)": node.navigator.window_needed,
         "history (kB)": node.navigator.held_bytes // 1024,
         "longest callback (ms)": f"{1e3 * node.longest_callback:.2f}",
-        "place of the IMU": node.extrinsics.source_of(IMU),
-        "place of the antenna": node.extrinsics.source_of(ANTENNA),
+        **{f"place of the {sensor}": node.extrinsics.source_of(sensor) for sensor in node.extrinsics.sensors},
     }
 
 
@@ -163,10 +164,11 @@ def counters(node: EskfNode) -> dict[str, object]:
 
 
 def topics(node: EskfNode, now: int) -> dict[str, object]:
-    """Rate and delay of each input."""
+    """Rate and delay of each input that was heard of."""
     found: dict[str, object] = {}
-    for monitor in node.monitors.values():
+    for monitor in node.monitors:
         timing = monitor.timing(now)
-        found[f"{monitor.topic} rate (Hz)"] = f"{timing.rate:.1f}"
-        found[f"{monitor.topic} delay (s)"] = f"{timing.delay:.3f} +- {timing.spread:.3f}"
+        if not math.isnan(timing.silence):
+            found[f"{monitor.label} rate (Hz)"] = f"{timing.rate:.1f}"
+            found[f"{monitor.label} delay (s)"] = f"{timing.delay:.3f} +- {timing.spread:.3f}"
     return found

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from functools import partial
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.bags import Batch
-from eskf_ros.filter.layout import ODOMETRY, Status, Stream
+from eskf_ros.filter.layout import ODOMETRY, Status
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.replay.inputs import Input
+from eskf_ros.inputs import Input
+from eskf_ros.ranges.intake import RangeIntake
 from eskf_ros.replay.topics import TopicNames
 
 LARGEST_PUSH = 1024
@@ -43,6 +43,7 @@ class Feed:
         order: str = "log",
         outages: tuple[tuple[float, float], ...] = (),
         ins_only: bool = False,
+        intake: RangeIntake | None = None,
     ) -> None:
         self._navigator = navigator
         self._topics = topics
@@ -53,11 +54,7 @@ class Feed:
         self.first_stamp: int | None = None
         self.imu_count = 0
         self.withheld = {kind.stream: 0 for kind in topics.inputs}
-        self._pushes: dict[Stream, Callable[..., None]] = {
-            kind.stream: partial(navigator.push, kind.stream) for kind in topics.inputs
-        }
-        self._pushes[Stream.GNSS_POSITION] = navigator.push_gnss_position
-        self._pushes[Stream.GNSS_VELOCITY] = navigator.push_gnss_velocity
+        self._pushes = {kind.name: kind.push_of(navigator, intake) for kind in topics.inputs}
 
     def ordered(self, batches: Iterable[dict[str, Batch]]) -> Iterable[dict[str, Batch]]:
         """The batches as they have to be pushed."""
@@ -89,7 +86,7 @@ class Feed:
             if kind.is_gnss and (self._gnss_over or self._in_outage(arguments[0])):
                 self.withheld[kind.stream] += 1
             else:
-                self._pushes[kind.stream](*arguments)
+                self._pushes[kind.name](*arguments)
         if imu is not None:
             push_imu_until(len(stamps))
         # As bytes: numpy copies structured arrays field by field and takes ten times as long.

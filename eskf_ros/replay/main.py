@@ -28,7 +28,7 @@ _EPILOG = """\
 results, in DIR/<bag name>_eskf/ (files of an earlier replay are replaced):
   odometry.mcap   odometry/global and gps/filtered; opens in Foxglove
   trajectory.tum  t x y z qx qy qz qw: base_link in map as it was published at that time, from the first known position
-  aids.csv        one line per GNSS message: stamp, arrival, aid, innovation, NIS, degrees of freedom, verdict
+  aids.csv        one line per GNSS message or signal: stamp, arrival, aid, innovation, NIS, degrees of freedom, verdict
   summary.json    everything in numbers
 
 A rosbag2 directory is one recording; several arguments are replayed one after the other.
@@ -116,9 +116,32 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--mode",
-        choices=("loose", "ins-only"),
-        default="loose",
-        help="ins-only: GNSS until the state is GOOD, then none (default: %(default)s)",
+        choices=("loose", "tight", "ins-only"),
+        default="",
+        help="loose: the receiver's fixes; tight: range and Doppler of each satellite; ins-only: GNSS until the state "
+        "is GOOD, then none (default: the parameter mode; tight with --ranges)",
+    )
+    parser.add_argument(
+        "--ranges",
+        type=Path,
+        metavar="FILE.obs",
+        help="RINEX observation file with the pseudoranges and Doppler of the drive, in place of the topic gnss/ranges",
+    )
+    parser.add_argument(
+        "--nav",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE.nav",
+        help="RINEX navigation file with the orbits of the satellites; can be given several times (default: the "
+        "parameter ranges.rinex_nav_files)",
+    )
+    parser.add_argument(
+        "--clock-offset",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="with --ranges: seconds by which the stamps of the recording are ahead of UTC (GPS time: 18)",
     )
     parser.add_argument(
         "--order",
@@ -202,7 +225,17 @@ def _replay(bag: Path, folder: Path, parameters: Parameters, options: argparse.N
     from eskf_ros.replay.run import Options, replay
     from eskf_ros.replay.topics import InputError
 
-    wanted = Options(folder, options.truth, tuple(options.outage), options.mode, options.order, options.output_rate)
+    wanted = Options(
+        folder,
+        options.truth,
+        tuple(options.outage),
+        options.mode,
+        options.order,
+        options.output_rate,
+        options.ranges,
+        tuple(options.nav),
+        options.clock_offset,
+    )
     try:
         with _progress(bag, options.quiet) as progress:
             summary = replay(bag, parameters, wanted, progress, started)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,15 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.bags import open_bag
+from eskf_ros.bags import BagReader, Batch, open_bag
 from eskf_ros.filter.layout import ODOMETRY
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.gnss.rinex import RinexError
+from eskf_ros.inputs import FIX
 from eskf_ros.parameters import Parameters
+from eskf_ros.ranges.beside import RangesError, merged, read_beside
+from eskf_ros.ranges.intake import RangeIntake
 from eskf_ros.replay.feed import Feed
-from eskf_ros.replay.inputs import FIX
 from eskf_ros.replay.results import ResultFiles, selected
-from eskf_ros.replay.summary import Summary, truth_result
-from eskf_ros.replay.topics import find_topics, truth_converter
+from eskf_ros.replay.summary import Summary, ranges_result, truth_result
+from eskf_ros.replay.topics import InputError, TopicNames, find_topics, truth_converter
 from eskf_ros.replay.truth import TruthComparison
 
 TRUTH_RATE = 50.0
@@ -28,14 +32,21 @@ TRUTH_RATE = 50.0
 
 @dataclass(frozen=True)
 class Options:
-    """What the command line asks for. Outages are (start, length) in s from the first IMU stamp."""
+    """What the command line asks for. Outages are (start, length) in s from the first IMU stamp.
+
+    ``mode``: loose, tight, ins-only, or empty for that of the parameters, tight with a file of `ranges`. ``ranges``,
+    ``navigation``: RINEX files beside the recording; ``clock_offset``: s by which its stamps are ahead of UTC.
+    """
 
     folder: Path
     truth: str = ""
     outages: tuple[tuple[float, float], ...] = ()
-    mode: str = "loose"
+    mode: str = ""
     order: str = "log"
     output_rate: float = 50.0
+    ranges: Path | None = None
+    navigation: tuple[Path, ...] = ()
+    clock_offset: float = 0.0
 
 
 class StageClock:
@@ -73,12 +84,14 @@ def replay(
         OSError: the results cannot be written.
     """
     clock = StageClock(time.perf_counter() if started is None else started)
+    parameters = with_options(parameters, options)
     with open_bag([bag]) as reader:
-        topics, hints = find_topics(reader, bag, parameters.topics, options.truth)
+        topics, hints = find_topics(reader, bag, parameters, options.truth, options.ranges is not None)
         to_epochs = truth_converter(topics, bag, parameters)
         thinned = bool(topics.truth) and 0.0 < options.output_rate < TRUTH_RATE
         navigator = Navigator(parameters, output_rate=0.0 if thinned else options.output_rate)
-        feed = Feed(navigator, topics, options.order, options.outages, options.mode == "ins-only")
+        intake, messages = open_ranges(navigator, parameters, options, reader, topics)
+        feed = Feed(navigator, topics, options.order, options.outages, options.mode == "ins-only", intake)
         truth = TruthComparison(parameters.gnss.lever_arm if topics.truth_type == FIX else (0.0, 0.0, 0.0))
         summary = Summary(feed, options.outages)
 
@@ -94,7 +107,7 @@ def replay(
                 clock.lap("wait")
 
             clock.lap("start")
-            for batch in feed.ordered(reader.batches(topics.wanted())):
+            for batch in feed.ordered(messages):
                 clock.lap("read")
                 rows = feed.push(batch)
                 clock.lap("filter")
@@ -109,13 +122,59 @@ def replay(
             compared = truth.compared() if topics.truth else None
             result = {
                 "bag": str(bag),
-                "mode": options.mode,
+                "mode": options.mode or parameters.mode,
                 "order": options.order,
                 **summary.result(navigator, clock.total()),
+                **({} if intake is None else ranges_result(navigator, intake)),
                 **({} if compared is None else truth_result(topics.truth, truth.offered, compared)),
                 "outages": summary.outages(compared),
-                "warnings": [*reader.warnings, *hints, *summary.warnings(navigator, topics, parameters)],
+                "warnings": [
+                    *reader.warnings,
+                    *hints,
+                    *(intake.complaints if intake is not None else ()),
+                    *summary.warnings(navigator, topics, parameters),
+                ],
                 "timing": clock.stages | {"write": files.seconds, "total": clock.total()},
             }
             files.write_summary(result)
     return result
+
+
+def with_options(parameters: Parameters, options: Options) -> Parameters:
+    """The parameters with what the options change in them."""
+    mode = options.mode if options.mode in ("loose", "tight") else ""
+    if not options.mode and options.ranges is not None and not parameters.ranges.use_point_solution:
+        mode = "tight"
+    if mode:
+        parameters = dataclasses.replace(parameters, mode=mode)
+    if options.navigation:
+        names = ":".join(str(path) for path in options.navigation)
+        parameters = dataclasses.replace(
+            parameters, ranges=dataclasses.replace(parameters.ranges, rinex_nav_files=names)
+        )
+    return parameters
+
+
+def open_ranges(
+    navigator: Navigator, parameters: Parameters, options: Options, reader: BagReader, topics: TopicNames
+) -> tuple[RangeIntake | None, Iterable[dict[str, Batch]]]:
+    """What takes the ranges, if there are any, and all messages of the recording and of the files beside it.
+
+    Raises InputError when a file cannot be read or does not belong to the recording.
+    """
+    batches = reader.batches(topics.wanted())
+    named = {kind.name: topic for kind, topic in topics.inputs.items()}
+    if "ranges" not in named:
+        if options.ranges is not None:
+            raise InputError("--ranges FILE is used in mode tight, or with ranges.use_point_solution in mode loose")
+        return None, batches
+    try:
+        intake = RangeIntake(navigator, parameters)
+        if options.ranges is not None:
+            files = [Path(name) for name in parameters.ranges.rinex_nav_files.split(":") if name]
+            offset = options.clock_offset
+            beside = read_beside(options.ranges, files, reader.start_time, reader.end_time, offset)
+            batches = merged(batches, {named["ranges"]: beside.ranges, named["ephemerides"]: beside.ephemerides})
+    except (RinexError, RangesError) as error:
+        raise InputError(str(error)) from error
+    return intake, batches

@@ -14,6 +14,8 @@ Stamps are integer ns, lengths m, times s; what is not known is null.
   about the local vertical, yaw 0 = east; biases in IMU axes.
 - `error`: absolute errors at the truth epochs from the first known position on, heading from the first known heading
   on; of the antenna when the truth is a NavSatFix. `nees`: e' P^-1 e, 3 degrees of freedom, so its ideal mean is 3.
+- `ranges`: `epochs` read, `signals` by `gnss.ranges.Status`, milliseconds the receiver's clock jumped by, how often
+  most satellites contradicted the state, which then was given the uncertainty they showed.
 - `outages[]`: `distance` is the length of the estimated path; the errors are those at the last truth epoch within.
 - `timing`: `write` is the work of a thread beside the others, of which `wait` was waited for.
 """
@@ -29,6 +31,7 @@ from numpy.typing import NDArray
 from eskf_ros.filter.layout import STREAM_NAMES, Status, Stream, Verdict
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.parameters import Parameters
+from eskf_ros.ranges.intake import RangeIntake
 from eskf_ros.replay.feed import Feed
 from eskf_ros.replay.topics import TopicNames
 from eskf_ros.replay.truth import rotation_matrices
@@ -151,7 +154,11 @@ class Summary:
                 f"{count} {name}" for name, count in self._verdict_counts(Stream.GNSS_POSITION).items()
             )
             fixes = topics.of(Stream.GNSS_POSITION)
-            lines.append(f"no position was found; what became of the fixes of {fixes}: {verdicts or 'none came'}")
+            if fixes:
+                lines.append(f"no position was found; what became of the fixes of {fixes}: {verdicts or 'none came'}")
+            else:
+                verdicts = ", ".join(f"{n} {name}" for name, n in self._verdict_counts(Stream.PSEUDORANGE).items())
+                lines.append(f"no position was found; what became of the pseudoranges: {verdicts or 'none came'}")
         return lines
 
 
@@ -167,6 +174,20 @@ def truth_result(topic: str, offered: int, compared: NDArray[Any]) -> dict[str, 
         },
         "error": {name: _error(compared[name]) for name in ("horizontal", "vertical", "speed", "heading_deg")},
         "nees": {name: _consistency(values) for name, values in nees.items()},
+    }
+
+
+def ranges_result(navigator: Navigator, intake: RangeIntake) -> dict[str, Any]:
+    """`ranges`: what became of epochs and signals before the filter, and what the filter found out about the clock."""
+    state = navigator.state[0]
+    return {
+        "ranges": {
+            "epochs": intake.epochs,
+            "point_solutions": intake.solved,
+            "signals": {status.name.lower(): count for status, count in sorted(navigator.range_statuses.items())},
+            "clock_jumps_ms": int(state["clock_jumps"]),
+            "outvoted_states": int(state["range_faults"]),
+        }
     }
 
 

@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from eskf_ros.bags import BagReader, Batch
 from eskf_ros.filter.layout import Stream
+from eskf_ros.inputs import FIX, FIXES, INPUTS, ODOMETRY, RANGES, TWIST, Input
 from eskf_ros.parameters import Parameters, Topics
-from eskf_ros.replay.inputs import FIX, INPUTS, TWIST, Input
 from eskf_ros.replay.truth import epochs_from_fix, epochs_from_odometry
 from eskf_ros.simulate.map_frame import MapFrame
 
 IMU = "sensor_msgs/msg/Imu"
-ODOMETRY = "nav_msgs/msg/Odometry"
 
 
 class InputError(Exception):
@@ -33,10 +32,13 @@ class TopicNames:
     inputs: Mapping[Input, str]
     truth: str = ""
     truth_type: str = ""
+    beside: frozenset[str] = frozenset()
+    """Topics that come out of other files than the recording."""
 
     def wanted(self) -> dict[str, str]:
         """What to read: topic -> type."""
-        types = {self.imu: IMU, **{topic: kind.type for kind, topic in self.inputs.items()}}
+        types = {self.imu: IMU}
+        types |= {topic: kind.type for kind, topic in self.inputs.items() if topic not in self.beside}
         return types | ({self.truth: self.truth_type} if self.truth else {})
 
     def of(self, stream: Stream) -> str:
@@ -44,29 +46,44 @@ class TopicNames:
         return next((topic for kind, topic in self.inputs.items() if kind.stream == stream), "")
 
 
-def find_topics(reader: BagReader, bag: Path, names: Topics, truth: str) -> tuple[TopicNames, list[str]]:
-    """Find the topics of the parameters `names`, and the `truth` topic unless empty, in the recording.
+def find_topics(
+    reader: BagReader, bag: Path, parameters: Parameters, truth: str, has_range_file: bool = False
+) -> tuple[TopicNames, list[str]]:
+    """Find the topics of the parameters, and the `truth` topic unless empty, in the recording.
 
-    All but IMU and fix may be missing as long as their names are the defaults; a list of hints says what else could be
-    the GNSS velocity.
+    All but the IMU and what GNSS is used by, fixes or ranges, may be missing as long as their names are the defaults;
+    with `has_range_file` the ranges come from there. Where an input can be of several types, the recording says which
+    it is. A list of hints says what else could be the GNSS velocity.
 
     Raises:
         InputError: another topic is missing, has no messages or the wrong type.
     """
+    names = parameters.topics
     imu = _require(reader, bag, names.imu, (IMU,), "set topics.imu in --config FILE")
+    uses_ranges = parameters.mode == "tight" or parameters.ranges.use_point_solution
+    unused = FIXES if uses_ranges else RANGES
     inputs = {}
     for kind in INPUTS:
         name, remedy = getattr(names, kind.name), f"set topics.{kind.name} in --config FILE"
-        is_required = kind.stream == Stream.GNSS_POSITION or name != getattr(Topics(), kind.name)
+        if kind.name in unused:
+            continue
+        if kind.name in RANGES and has_range_file:
+            inputs[kind] = name
+            continue
+        is_required = kind.name in ("gnss_fix", "ranges") or name != getattr(Topics(), kind.name)
         if is_required or _find(reader, name):
-            inputs[kind] = _require(reader, bag, name, (kind.type,), remedy)
-    hints = [] if any(kind.stream == Stream.GNSS_VELOCITY for kind in inputs) else _velocity_hint(reader, names, inputs)
+            instead = " (a RINEX file can be given with --ranges FILE.obs)" if kind.name == "ranges" else ""
+            topic = _require(reader, bag, name, kind.types, remedy, instead)
+            inputs[kind.of_type(reader.topics[topic].type)] = topic
+    has_velocity = uses_ranges or any(kind.stream == Stream.GNSS_VELOCITY for kind in inputs)
+    hints = [] if has_velocity else _velocity_hint(reader, names, inputs)
+    beside = frozenset(inputs[kind] for kind in inputs if kind.name in RANGES) if has_range_file else frozenset()
     if not truth:
-        return TopicNames(imu, inputs), hints
+        return TopicNames(imu, inputs, beside=beside), hints
     topic = _require(reader, bag, truth, (ODOMETRY, FIX), "name it with --truth TOPIC")
     if topic in (imu, *inputs.values()):
         raise InputError(f"{bag}: --truth {truth} is an input of the estimator; truth has to be another topic")
-    return TopicNames(imu, inputs, topic, reader.topics[topic].type), hints
+    return TopicNames(imu, inputs, topic, reader.topics[topic].type, beside), hints
 
 
 def _velocity_hint(reader: BagReader, names: Topics, inputs: Mapping[Input, str]) -> list[str]:
@@ -91,7 +108,7 @@ def _find(reader: BagReader, name: str) -> str:
     return inside[0] if len(inside) == 1 else ""
 
 
-def _require(reader: BagReader, bag: Path, name: str, types: tuple[str, ...], remedy: str) -> str:
+def _require(reader: BagReader, bag: Path, name: str, types: tuple[str, ...], remedy: str, instead: str = "") -> str:
     topic = _find(reader, name)
     if topic and reader.topics[topic].type in types and reader.topics[topic].count:
         return topic
@@ -104,7 +121,7 @@ def _require(reader: BagReader, bag: Path, name: str, types: tuple[str, ...], re
     there = ", ".join(f"{topic} ({info.type}, {info.count})" for topic, info in sorted(reader.topics.items()))
     fitting = [topic for topic, info in sorted(reader.topics.items()) if info.type in types and info.count]
     advice = f"{remedy}: {' or '.join(fitting)}" if fitting else f"nothing in it is {' or '.join(types)}"
-    raise InputError(f"{bag}: {problem}; {advice}. It holds: {there}")
+    raise InputError(f"{bag}: {problem}; {advice}{instead}. It holds: {there}")
 
 
 def truth_converter(topics: TopicNames, bag: Path, parameters: Parameters) -> Callable[[Batch], NDArray[Any]]:

@@ -53,13 +53,17 @@ def barometer(measured: BarometerMeasurements, part: slice) -> NDArray[Any]:
 
 
 def dual_antenna(measured: DualAntennaMeasurements, part: slice) -> NDArray[Any]:
-    """Return sensor_msgs/Imu with the yaw of the baseline; roll and pitch are zero and may be anything."""
+    """Return sensor_msgs/Imu with yaw and pitch of the baseline; what is not measured is zero and may be anything."""
     messages = _stamped("sensor_msgs/msg/Imu", measured.stamp[part], Frame.GNSS)
-    messages["orientation"][:, 2] = np.sin(0.5 * measured.yaw[part])
-    messages["orientation"][:, 3] = np.cos(0.5 * measured.yaw[part])
+    yaw, pitch = 0.5 * measured.yaw[part], 0.5 * measured.pitch[part]
+    messages["orientation"][:, 0] = -np.sin(yaw) * np.sin(pitch)
+    messages["orientation"][:, 1] = np.cos(yaw) * np.sin(pitch)
+    messages["orientation"][:, 2] = np.sin(yaw) * np.cos(pitch)
+    messages["orientation"][:, 3] = np.cos(yaw) * np.cos(pitch)
     # A first element of -1 would say that there is no orientation at all (REP-145).
-    yaw_variance = math.radians(measured.sensor.yaw_std_deg) ** 2
-    messages["orientation_covariance"] = np.diag([math.pi**2, math.pi**2, yaw_variance]).ravel()
+    stds = (math.inf, measured.sensor.pitch_std_deg, measured.sensor.yaw_std_deg)
+    variances = [min(math.radians(std), math.pi) ** 2 for std in stds]
+    messages["orientation_covariance"] = np.diag(variances).ravel()
     messages["angular_velocity_covariance"][:, 0] = ABSENT
     messages["linear_acceleration_covariance"][:, 0] = ABSENT
     return messages

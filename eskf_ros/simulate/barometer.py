@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,8 @@ _PHASE = 0.0073
 
 STANDARD_PRESSURE = 101325.0
 """Pressure (Pa) of the standard atmosphere at sea level."""
+METRES_PER_PASCAL = 0.083
+"""Near sea level."""
 _TEMPERATURE = 288.15
 _LAPSE_RATE = 0.0065
 _EXPONENT = 9.80665 * 0.0289644 / (8.31432 * _LAPSE_RATE)
@@ -53,6 +56,15 @@ class Barometer:
     def __post_init__(self) -> None:
         """Raise ValueError for a rate that is none."""
         check_rate("rate of the barometer", self.rate)
+
+    def parameters(self) -> dict[str, Any]:
+        """Return the estimator's parameters that describe this sensor, by dotted name."""
+        return {
+            "baro.position": list(self.position),
+            "baro.offset_random_walk": METRES_PER_PASCAL * self.drift,
+            "baro.std_floor": max(self.noise_std, 0.1),
+            "baro.scale_std": 0.002,
+        }
 
     def measure(
         self, section: Section, _episodes: Sequence[Episode], seed: np.random.SeedSequence

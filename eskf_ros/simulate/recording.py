@@ -172,10 +172,12 @@ class Recording(GnssMeasurements):
 
     def parameters(self) -> dict[str, Any]:
         """Return the estimator's parameters that describe the sensors of this recording, by dotted name."""
+        described = (self.options.dual_antenna, self.options.barometer)
         return {
             **grade_parameters(self.options.grade),
             "imu.mount_position": list(self.options.imu_position),
             "imu.mount_rpy_deg": list(self.options.imu_rpy_deg),
             "gnss.lever_arm": list(self.options.lever_arm),
             "datum": list(self.datum),
+            **{name: value for sensor in described if sensor for name, value in sensor.parameters().items()},
         }

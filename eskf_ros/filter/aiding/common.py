@@ -7,7 +7,7 @@ import math
 from eskf_ros.compiled import njit
 from eskf_ros.filter.layout import ATTITUDE, ERROR_CAPACITY, ERROR_SIZE, GYRO_BIAS, VELOCITY
 from eskf_ros.filter.strapdown import gravity_map
-from eskf_ros.rotation import cross, dot, rotate, rotate_back
+from eskf_ros.rotation import cross, dot, rotate, rotate_back, to_matrix
 
 
 @njit
@@ -129,3 +129,28 @@ def horizontal_acceleration(state, rotation, force):
     a = (felt[0] + g[0], felt[1] + g[1], felt[2] + g[2])
     along = dot(a, g) / dot(g, g)
     return math.sqrt((a[0] - along * g[0]) ** 2 + (a[1] - along * g[1]) ** 2 + (a[2] - along * g[2]) ** 2)
+
+
+@njit
+def to_local(state, local_to_ecef, direction_body):
+    """Return a direction of the body in the axes whose rotation to ECEF is given (East-North-Up at its place)."""
+    direction_map = rotate(to_matrix(state.attitude), direction_body)
+    return rotate_back(local_to_ecef, rotate(state.map_to_ecef, direction_map))
+
+
+@njit
+def set_attitude_row(jacobian, row, state, local_to_ecef, local):
+    """Write how a small rotation about the local axes (``local``) changes a scalar, in map axes."""
+    in_map = rotate_back(state.map_to_ecef, rotate(local_to_ecef, local))
+    for i in range(3):
+        jacobian[row, ATTITUDE + i] = in_map[i]
+
+
+@njit
+def azimuth_change(direction, level_square):
+    """Return how a small rotation about local axes changes the angle of ``direction`` from east in the level plane.
+
+    theta x d has the angle (d_e (theta x d)_n - d_n (theta x d)_e) / (d_e^2 + d_n^2), the latter is ``level_square``.
+    """
+    slope = -direction[2] / level_square
+    return (slope * direction[0], slope * direction[1], 1.0)

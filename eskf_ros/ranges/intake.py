@@ -1,0 +1,145 @@
+"""Messages of `gnss/ranges` and `gnss/ephemerides` on their way into the navigator: the same for node and replay."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from eskf_ros.filter.navigator import Navigator
+from eskf_ros.gnss.cloud import CloudError, Epoch, read_epoch
+from eskf_ros.gnss.ephemeris import Ephemerides
+from eskf_ros.gnss.ephemeris_cloud import read_ephemerides
+from eskf_ros.gnss.measurements import Masks, measured_epoch
+from eskf_ros.gnss.point_solution import PointSettings, PointSolution, SolutionStatus, solve
+from eskf_ros.gnss.range_files import read_navigation_files
+from eskf_ros.gnss.range_model import NO_KLOBUCHAR
+from eskf_ros.gnss.ranges import Status, locate, one_per_satellite
+from eskf_ros.gnss.signals import Gnss
+from eskf_ros.parameters import Parameters
+
+HORIZON = math.radians(-90.0)
+"""No elevation mask: where the receiver is, only the filter knows."""
+
+COVARIANCE_KNOWN = 3
+STATUS_FIX = 0
+
+REMEDIES = {
+    Status.NO_EPHEMERIS: "set ranges.rinex_nav_files, or record topics.ephemerides",
+    Status.STALE: "the ephemerides are of another time: set ranges.rinex_nav_files to files of the day",
+    Status.WRONG_WEEK: "the week of the time tags or of the ephemerides is wrong",
+    Status.UNHEALTHY: "the satellites say that they are not to be used",
+    Status.UNKNOWN_SIGNAL: "the numbers gnss_id and sig_id are those of u-blox",
+    Status.BAD_VALUE: "pseudoranges are in m, Doppler in Hz",
+    Status.LOW_CN0: "ranges.cn0_mask leaves them out",
+}
+
+BLAMED_SHARE = 0.5
+"""Of all signals: so many that cannot be used for one reason are worth a sentence."""
+
+NORMAL = (Status.USABLE, Status.OTHER_SIGNAL)
+
+
+class RangeIntake:
+    """Turns clouds into epochs of signals and gives them to a navigator.
+
+    Attributes:
+        epochs: epochs that were read.
+        solved: epochs of which a point solution was made (mode loose with ``ranges.use_point_solution``).
+        refused: messages that could not be read, by reason.
+    """
+
+    def __init__(self, navigator: Navigator, parameters: Parameters) -> None:
+        """Raises RinexError when a file of ``ranges.rinex_nav_files`` cannot be read."""
+        self._navigator = navigator
+        self._solves = parameters.mode == "loose" and parameters.ranges.use_point_solution
+        self._masks = Masks(HORIZON, parameters.ranges.cn0_mask)
+        self._point_settings = PointSettings(
+            elevation_mask=math.radians(parameters.ranges.elevation_mask_deg), cn0_mask=parameters.ranges.cn0_mask
+        )
+        self._time_offset = parameters.ranges.time_offset
+        files = read_navigation_files([Path(name) for name in parameters.ranges.rinex_nav_files.split(":") if name])
+        self._ephemerides = Ephemerides(files.records)
+        self._klobuchar = files.klobuchar.get(Gnss.GPS, NO_KLOBUCHAR)
+        self._last: NDArray[np.float64] | None = None
+        self.epochs = 0
+        self.solved = 0
+        self.refused: Counter[str] = Counter()
+
+    def take_ephemerides(self, stamp: int, points: NDArray[Any], arrival: int = 0) -> None:
+        """Add the points of a message of `gnss/ephemerides`; they serve the ranges that come after them."""
+        try:
+            read = read_ephemerides(points)
+        except CloudError as error:
+            self.refused[f"ephemerides: {error}"] += 1
+            return
+        for reason, count in read.refused.items():
+            self.refused[f"ephemerides: {reason}"] += count
+        if len(read.broadcasts):
+            self._ephemerides.add(read.records)
+        self._klobuchar = read.klobuchar.get(Gnss.GPS, self._klobuchar)
+
+    def take_ranges(self, stamp: int, points: NDArray[Any], arrival: int = 0) -> PointSolution | None:
+        """Give the points of a message of `gnss/ranges` to the navigator; return the point solution if one was made."""
+        try:
+            epoch = read_epoch(points)
+        except CloudError as error:
+            self.refused[f"ranges: {error}"] += 1
+            return None
+        if math.isnan(epoch.seconds):
+            self.refused["ranges: no time tag in the epoch"] += 1
+            return None
+        if epoch.left_out:
+            self.refused["ranges: signals beyond the first 200 of an epoch"] += epoch.left_out
+        self.epochs += 1
+        if self._solves:
+            return self._push_solution(stamp, epoch, arrival)
+        instant = (epoch.week, epoch.seconds)
+        signals = measured_epoch(epoch.ranges, *instant, self._ephemerides, masks=self._masks)
+        self._navigator.push_ranges(stamp, instant, signals, self._klobuchar, arrival)
+        return None
+
+    def _push_solution(self, stamp: int, epoch: Epoch, arrival: int) -> PointSolution:
+        """Give position and velocity of the epoch alone to the navigator, as a receiver would."""
+        locate(epoch.ranges, epoch.week, epoch.seconds, self._ephemerides)
+        self._navigator.range_statuses.update(Status(status) for status in epoch.ranges["status"].tolist())
+        ranges, klobuchar = one_per_satellite(epoch.ranges), self._klobuchar
+        solution = solve(ranges, epoch.week, epoch.seconds, klobuchar, self._point_settings, self._last)
+        stamp += round(self._time_offset * 1e9)
+        if solution.status == SolutionStatus.SOLVED:
+            self.solved += 1
+            self._last = solution.position_ecef
+            latitude, longitude, altitude = solution.geodetic
+            self._navigator.push_gnss_position(
+                stamp,
+                math.degrees(latitude),
+                math.degrees(longitude),
+                altitude,
+                solution.covariance_enu.ravel(),
+                COVARIANCE_KNOWN,
+                STATUS_FIX,
+                arrival,
+            )
+        if solution.velocity_status == SolutionStatus.SOLVED:
+            covariance = solution.velocity_covariance_enu.ravel()
+            self._navigator.push_gnss_velocity(stamp, solution.velocity_enu.tolist(), covariance, arrival)
+        return solution
+
+    @property
+    def complaints(self) -> list[str]:
+        """What is wrong with the messages, one sentence each with what to do; empty when nothing is."""
+        found = [f"{count} times: {reason}" for reason, count in self.refused.items()]
+        statuses = self._navigator.range_statuses
+        total = sum(statuses.values()) - statuses[Status.OTHER_SIGNAL]
+        for status, count in statuses.items():
+            if status not in NORMAL and count > BLAMED_SHARE * total:
+                remedy = REMEDIES.get(status, "")
+                found.append(
+                    f"{count} of {total} signals cannot be used ({status.name.lower()})"
+                    + (f": {remedy}" * bool(remedy))
+                )
+        return found

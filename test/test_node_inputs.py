@@ -1,0 +1,146 @@
+"""The table of inputs: the parameters it needs exist, and a message says the same to the node and to the replay."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from ros_process import needs_ros
+
+from eskf_ros.bags import Batch, StringTable, decode, encode, message_dtype
+from eskf_ros.filter.layout import Stream, Verdict
+from eskf_ros.filter.navigator import Navigator
+from eskf_ros.filter.settings import intakes_from
+from eskf_ros.inputs import INPUTS
+from eskf_ros.parameters import Leaf, ParameterError, Parameters, from_mapping, leaves
+
+SECOND = 1_000_000_000
+STAMP = 1_700_000_000_123_456_789
+LEAVES: dict[str, Leaf] = {leaf.name: leaf for leaf in leaves()}
+EVERY_TYPE = [(kind, name) for kind in INPUTS for name in kind.types]
+names = [f"{kind.name}-{name.rpartition('/')[2]}" for kind, name in EVERY_TYPE]
+
+
+def serialised(type_name: str, frame: str = "sensor", seed: int = 1, stamp: int = STAMP) -> bytes:
+    """A message with a different number in every place, in the layout of the recordings."""
+    generator = np.random.default_rng(seed)
+    message = np.zeros(1, message_dtype(type_name))
+    for field in message.dtype.names or ():
+        kind = message.dtype[field].base.kind
+        message[field] = generator.normal(size=message[field].shape) if kind == "f" else 1
+    message["stamp"] = stamp
+    if "child_frame_id" in (message.dtype.names or ()):
+        message["frame_id"], message["child_frame_id"] = 0, 1
+    else:
+        message["frame_id"] = 0
+    return bytes(encode(type_name, message, [frame, "child"])[0])
+
+
+def test_every_input_has_its_parameters() -> None:
+    for kind in INPUTS:
+        assert f"topics.{kind.name}" in LEAVES
+        choice = LEAVES.get(f"topics.{kind.name}_type")
+        assert (choice.rule.pattern.split("|") if choice else [kind.type]) == list(kind.types)
+        assert kind.stream in intakes_from(Parameters())
+    assert len({kind.name for kind in INPUTS}) == len({kind.stream for kind in INPUTS}) == len(INPUTS)
+    assert {name for name in LEAVES if name.startswith("topics.") and name.endswith("_type")} == {
+        f"topics.{kind.name}_type" for kind in INPUTS if kind.others
+    }
+
+
+def arguments_in_a_recording(kind: Any, type_name: str, data: bytes, arrival: int) -> list[Any]:
+    strings = StringTable(["of another topic"])
+    messages, valid = decode(type_name, np.frombuffer(data, np.uint8)[None], strings)
+    assert valid is None
+    return list(kind.of_type(type_name).arguments(Batch(np.array([arrival]), messages, strings.values)))
+
+
+def same(a: Any, b: Any) -> bool:
+    return np.array_equal(a, b) if isinstance(a, np.ndarray) else type(a) is type(b) and a == b
+
+
+@needs_ros
+@pytest.mark.parametrize(("kind", "type_name"), EVERY_TYPE, ids=names)
+def test_node_and_replay_give_the_estimator_the_same_numbers(kind: Any, type_name: str) -> None:
+    """A message that the message library has serialised, of every input in every type; and it has what was sent."""
+    from rclpy.serialization import deserialize_message, serialize_message
+
+    from eskf_ros.node.inputs import AidInput, message_class
+
+    choice = {f"topics.{kind.name}_type": type_name} if kind.others else {}
+    source = AidInput(kind, from_mapping(choice), "topic")
+    for seed, frame in enumerate(("sensor", "", "gps/antenna_2", "größe")):
+        message = deserialize_message(serialised(type_name, frame, seed), message_class(type_name))
+        data = serialize_message(message)
+        batch = source.read(data, 5)
+        assert batch.strings[int(batch.messages["frame_id"][0])] == frame
+        (found,) = source.arguments(batch)
+        (expected,) = arguments_in_a_recording(kind, type_name, data, 5)
+        assert len(found) == len(expected)
+        assert all(map(same, found, expected))
+        assert found[0] == message.header.stamp.sec * SECOND + message.header.stamp.nanosec == STAMP
+        kind.push_of(Navigator(Parameters()))(*found)
+
+
+@needs_ros
+@pytest.mark.parametrize(("kind", "type_name"), EVERY_TYPE, ids=names)
+def test_what_is_no_message_is_refused_and_other_encodings_are_read(kind: Any, type_name: str) -> None:
+    from eskf_ros.node.inputs import AidInput
+
+    choice = {f"topics.{kind.name}_type": type_name} if kind.others else {}
+    source = AidInput(kind, from_mapping(choice), "topic")
+    good = serialised(type_name)
+    for bad in (b"", good[:3], good[:11], good[: len(good) // 2], b"\x7f" * 40):
+        with pytest.raises(Exception, match=r".+"):
+            source.read(bad, 5)
+    (expected,) = source.arguments(source.read(good, 5))
+    padded = good[:2] + b"\x00\x03" + good[4:]  # the padding at the end, counted in the options
+    (found,) = source.arguments(source.read(padded, 5))
+    assert all(map(same, found, expected))
+
+
+def test_a_velocity_without_covariance_takes_the_stand_in() -> None:
+    """TwistStamped has none: the estimator is told so, and not that the velocity is exact."""
+    (kind,) = (kind for kind in INPUTS if kind.stream == Stream.GNSS_VELOCITY)
+    data = serialised("geometry_msgs/msg/TwistStamped")
+    (arguments,) = arguments_in_a_recording(kind, "geometry_msgs/msg/TwistStamped", data, 5)
+    assert not np.any(arguments[2])
+    navigator = Navigator(from_mapping({"gnss.unknown_velocity_std": 0.7}))
+    kind.push_of(navigator)(*arguments)
+    offered = navigator._offered[0]
+    assert offered["door"] == Verdict.WAITING
+    assert offered["payload"][[3, 6, 8]].tolist() == [0.7**2] * 3
+
+
+@needs_ros
+def test_each_receiver_has_its_own_offset_and_its_own_clock() -> None:
+    from eskf_ros.node.inputs import open_inputs
+
+    given = {
+        "gnss.time_offset": -0.1,
+        "second_gnss.frame_id": "rear",
+        "second_gnss.time_offset": -3.0,
+        "wheel.time_offset": 0.25,
+    }
+    inputs = {source.kind.name: source for source in open_inputs(from_mapping(given), lambda name: f"/{name}")}
+    fixes, wheel = inputs["gnss_fix"], inputs["wheel"]
+    assert (fixes.receiver("front"), fixes.receiver("rear"), wheel.receiver("rear")) == (0, 1, 0)
+    assert (fixes.offset(0), fixes.offset(1), wheel.offset(0)) == (-SECOND // 10, -3 * SECOND, SECOND // 4)
+    assert [monitor.label for monitor in fixes.monitors] == ["/gps/fix", "/gps/fix from rear"]
+    assert [monitor.topic for monitor in fixes.monitors] == ["/gps/fix", "/gps/fix"]
+    assert len(wheel.monitors) == 1
+    # Without a second receiver every frame is that of the first, the empty one too.
+    one = {source.kind.name: source for source in open_inputs(Parameters(), str)}["gnss_fix"]
+    assert (one.receiver(""), one.receiver("rear"), len(one.monitors)) == (0, 0, 1)
+
+
+@needs_ros
+def test_a_type_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    from eskf_ros.node.inputs import open_inputs
+
+    monkeypatch.setitem(sys.modules, "nav_msgs.msg", None)
+    with pytest.raises(ParameterError, match=r"topics\.wheel_type.*nav_msgs/msg/Odometry is not installed"):
+        open_inputs(Parameters(), str)

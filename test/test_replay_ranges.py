@@ -1,0 +1,162 @@
+"""eskf_replay on ranges: out of the recording, out of RINEX files beside it, and what is said when they are missing."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gnss_observation_text import observation_text
+
+from eskf_ros.bags import BagWriter, open_bag
+from eskf_ros.filter.layout import Stream
+from eskf_ros.replay.main import main
+from eskf_ros.simulate.main import main as simulate_main
+from eskf_ros.simulate.range_receiver import RangeReceiver
+from eskf_ros.simulate.scenario import simulate
+
+CHECKOUT = Path(__file__).resolve().parent.parent
+CONFIG = CHECKOUT / "config" / "tunnel_drive.yaml"
+SKY = CHECKOUT / "bags" / "sky.nav"
+PART = {"start": 12.0, "stop": 72.0}
+TIGHT = ("--mode", "tight")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A minute of a drive with ranges and ephemerides, the same without, and its ranges as a RINEX file."""
+    folder = tmp_path_factory.mktemp("ranges")
+    part = [f"--set={name}={value:g}" for name, value in PART.items()]
+    for name, sensor in (("ranges", ["--sensor", "ranges"]), ("plain", [])):
+        command = ["drive", "--seed", "4", *part, *sensor, "--quiet", "--out", str(folder / f"{name}.mcap")]
+        assert simulate_main(command) == 0
+    measured = simulate("drive", 4, **PART, ranges=RangeReceiver()).ranges
+    assert measured is not None
+    epochs = [
+        (int(week), float(second), measured.epoch(k))
+        for k, (week, second) in enumerate(zip(measured.week, measured.seconds))
+    ]
+    (folder / "rover.obs").write_text(observation_text(epochs, (4.2e6, 8.5e5, 4.7e6)), encoding="ascii")
+    return folder
+
+
+def replay(bag: Path, *options: str, config: Path = CONFIG) -> dict[str, Any]:
+    command = [str(bag), "--config", str(config), "--truth", "truth", "--out", str(bag.parent / "out"), "--quiet"]
+    assert main([*command, *options]) == 0
+    result: dict[str, Any] = json.loads((bag.parent / "out" / f"{bag.stem}_eskf" / "summary.json").read_text())
+    return result
+
+
+def with_parameters(folder: Path, *lines: str) -> Path:
+    config = folder / "changed.yaml"
+    config.write_text(CONFIG.read_text() + "".join(f"    {line}\n" for line in lines), encoding="utf-8")
+    return config
+
+
+def refusal(capsys: pytest.CaptureFixture[str], command: Sequence[str]) -> str:
+    assert main([*command, "--quiet"]) == 2
+    return capsys.readouterr().err
+
+
+def test_tight_from_the_recording(folder: Path) -> None:
+    """No fix is used, the ephemerides come from the recording, and the result is that of good ranges."""
+    result = replay(folder / "ranges.mcap", *TIGHT)
+    assert result["mode"] == "tight"
+    assert set(result["aids"]) == {"pseudorange", "range_rate"}
+    for aid in result["aids"].values():
+        assert aid["fused"] > 0.85 * aid["offered"] > 1000
+    assert result["ranges"]["epochs"] > 200
+    assert result["ranges"]["signals"]["usable"] == result["aids"]["pseudorange"]["offered"]
+    assert result["final"]["status"] == "GOOD"
+    # What models leave of atmosphere and orbits changes in half an hour: it stays.
+    assert result["error"]["horizontal"]["p50"] < 2.5
+    assert result["error"]["speed"]["p50"] < 0.1
+    assert result["warnings"] == []
+
+
+def test_the_mode_is_a_parameter_too(folder: Path) -> None:
+    config = with_parameters(folder, "mode: tight")
+    assert replay(folder / "ranges.mcap", config=config)["final"] == replay(folder / "ranges.mcap", *TIGHT)["final"]
+    loose = replay(folder / "ranges.mcap", "--mode", "loose", config=config)
+    assert set(loose["aids"]) == {"gnss_position", "gnss_velocity"}
+    assert "ranges" not in loose
+
+
+def test_order_of_log_and_of_stamps_end_in_the_same_state(folder: Path) -> None:
+    by_log, by_stamp = (replay(folder / "ranges.mcap", *TIGHT, "--order", order) for order in ("log", "stamp"))
+    assert by_log["final"] == by_stamp["final"]
+    assert by_log["aids"] == by_stamp["aids"]
+
+
+@pytest.mark.parametrize("ahead", [0.0, 0.7])
+def test_rinex_files_beside_the_recording(folder: Path, ahead: float) -> None:
+    """The same drive, to the millimetres that the file rounds away and the 0.1 ms of its time tags."""
+    files = ["--ranges", str(folder / "rover.obs"), "--nav", str(SKY)]
+    config = with_parameters(folder, "ranges:", f"  time_offset: {ahead}")
+    beside = replay(folder / "plain.mcap", *files, "--clock-offset", str(-ahead), config=config)
+    recorded = replay(folder / "ranges.mcap", *TIGHT)
+    assert beside["mode"] == "tight"
+    assert beside["ranges"]["epochs"] == recorded["ranges"]["epochs"]
+    np.testing.assert_allclose(beside["final"]["position"], recorded["final"]["position"], atol=0.02)
+    np.testing.assert_allclose(beside["final"]["velocity"], recorded["final"]["velocity"], atol=0.005)
+
+
+def test_an_outage_withholds_the_ranges(folder: Path) -> None:
+    result = replay(folder / "ranges.mcap", *TIGHT, "--outage", "40:10")
+    assert result["aids"]["pseudorange"]["withheld"] == pytest.approx(50, abs=2)
+    assert 0.1 < result["outages"][0]["horizontal"] < 30.0
+    ins_only = replay(folder / "ranges.mcap", "--mode", "ins-only", config=with_parameters(folder, "mode: tight"))
+    assert ins_only["aids"]["pseudorange"]["withheld"] > 100
+
+
+def test_loose_on_our_own_point_solution(folder: Path) -> None:
+    """In place of the receiver's fixes, which are not even read."""
+    config = with_parameters(folder, "ranges:", "  use_point_solution: true")
+    result = replay(folder / "ranges.mcap", config=config)
+    assert result["mode"] == "loose"
+    assert set(result["aids"]) >= {"gnss_position", "gnss_velocity"}
+    assert result["ranges"]["point_solutions"] == result["aids"]["gnss_position"]["offered"] > 200
+    assert result["aids"]["gnss_position"]["fused"] > 200
+    assert result["error"]["horizontal"]["p50"] < 3.0
+    files = ["--ranges", str(folder / "rover.obs"), "--nav", str(SKY)]
+    assert replay(folder / "plain.mcap", *files, config=config)["mode"] == "loose"
+
+
+def test_missing_ephemerides_are_named_with_the_remedy(folder: Path) -> None:
+    bare = folder / "bare.mcap"
+    with open_bag([folder / "ranges.mcap"]) as reader, BagWriter(bare) as writer:
+        types = {topic: info.type for topic, info in reader.topics.items() if topic != "gnss/ephemerides"}
+        handles = {topic: writer.add_topic(topic, kind) for topic, kind in types.items()}
+        for batch in reader.batches(types):
+            for topic, part in batch.items():
+                writer.write(handles[topic], part.log_time, part.messages, part.strings)
+    result = replay(bare, *TIGHT)
+    assert any("no_ephemeris" in line and "ranges.rinex_nav_files" in line for line in result["warnings"])
+    assert any("no position was found" in line for line in result["warnings"])
+    with_file = replay(bare, *TIGHT, "--nav", str(SKY))
+    assert with_file["final"]["status"] == "GOOD"
+    assert with_file["warnings"] == []
+
+
+def test_what_does_not_fit_is_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plain = str(folder / "plain.mcap")
+    text = refusal(capsys, [plain, *TIGHT])
+    assert "no topic gnss/ranges" in text
+    assert "--ranges FILE.obs" in text
+    obs = ["--ranges", str(folder / "rover.obs")]
+    assert "mode tight" in refusal(capsys, [plain, "--mode", "loose", *obs])
+    assert "missing.nav" in refusal(capsys, [plain, *obs, "--nav", str(folder / "missing.nav")])
+    assert "not of the time of the recording" in refusal(
+        capsys, [plain, *obs, "--nav", str(SKY), "--clock-offset", "9999"]
+    )
+    assert "not observation data" in refusal(capsys, [plain, "--ranges", str(SKY), "--nav", str(SKY)])
+
+
+def test_every_signal_has_its_row(folder: Path) -> None:
+    replay(folder / "ranges.mcap", *TIGHT)
+    lines = (folder / "out" / "ranges_eskf" / "aids.csv").read_text().splitlines()[1:]
+    names = [line.split(",")[2] for line in lines]
+    assert names.count(Stream.PSEUDORANGE.name.lower()) == names.count(Stream.RANGE_RATE.name.lower()) > 1000
