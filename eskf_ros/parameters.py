@@ -154,6 +154,13 @@ class Topics:
         "sensor_msgs/PointCloud2: orbits and clocks of the satellites, one point per broadcast ephemeris.",
         **_TOPIC,
     )
+    initial_pose: str = _parameter(
+        "initialpose",
+        "",
+        "geometry_msgs/PoseWithCovarianceStamped in frames.map: puts the estimate there, as RViz's tool does. Position "
+        "and yaw are taken over; a height without variance is not. The replay does not read it.",
+        **_TOPIC,
+    )
 
 
 @dataclass(frozen=True)

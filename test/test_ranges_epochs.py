@@ -73,7 +73,8 @@ def follow(recording: Recording, ranges: Ranges, navigator: Navigator) -> Outcom
     errors, covariances, clocks = [], [], []
     for k, (i, state) in enumerate(run_tight(recording, ranges, navigator, stops)):
         errors.append(state_error(recording, i, int(truth[k]), state))
-        covariances.append(state["covariance"][: clock + 2, : clock + 2].copy())
+        kept = [*range(15), clock, clock + 1]
+        covariances.append(state["covariance"][np.ix_(kept, kept)])
         estimated = state["optional"][clock - 15 : clock - 13]
         clocks.append([ranges.bias[chosen[k]] - estimated[0], ranges.drift[chosen[k]] - estimated[1]])
     seconds = ranges.seconds[chosen] - ranges.seconds[0]

@@ -28,10 +28,10 @@ OPTIONAL_SIZES = {
     "position_error": 3,
     "mounting": 2,
     "wheel_scale": 1,
-    "baro_offset": 1,
-    "baro_scale": 1,
     "clock": 2,
     "inter_system": 6,
+    "baro_offset": 1,
+    "baro_scale": 1,
 }
 """Optional errors behind the core, and how many each is: see ``optional``.
 

@@ -230,11 +230,11 @@ def place_optional_states(settings: np.void, parameters: Parameters) -> None:
         ("position_error", time > 0.0, 1.0, math.sqrt(2.0 / time) if time else 0.0, time, (Stream.GNSS_POSITION,)),
         ("mounting", estimate.mounting, mounting_std, mounting_walk, 0.0, (Stream.NHC, Stream.WHEEL)),
         ("wheel_scale", estimate.wheel_scale, scale_std, scale_walk, 0.0, (Stream.WHEEL,)),
+        ("clock", is_tight, START_CLOCK_STD, clock_noise, 0.0, (Stream.PSEUDORANGE, Stream.RANGE_RATE)),
+        ("inter_system", is_tight, inter_system_stds(parameters), ranges.inter_system_noise, 0.0, ()),
         # Not by whether it is used, which may change while running: places stay.
         ("baro_offset", True, baro.offset_std, baro.offset_random_walk, 0.0, (Stream.BARO,)),
         ("baro_scale", True, baro.scale_std, 0.0, 0.0, (Stream.BARO,)),
-        ("clock", is_tight, START_CLOCK_STD, clock_noise, 0.0, (Stream.PSEUDORANGE, Stream.RANGE_RATE)),
-        ("inter_system", is_tight, inter_system_stds(parameters), ranges.inter_system_noise, 0.0, ()),
     )
     for name, is_on, std, noise_density, time, streams in blocks:
         settings[f"{name}_at"] = end if is_on else NOWHERE

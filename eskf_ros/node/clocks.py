@@ -13,6 +13,9 @@ SECOND = 1_000_000_000
 MEMORY = 100
 """Messages over which delay and rate are taken."""
 
+LONG_AGO = 10.0
+"""Stamps so many seconds behind their arrival are those of a recording, or of a clock that was never set."""
+
 CONFIRMATIONS = 5
 """So many messages in a row must go on from where the stamps jumped to."""
 
@@ -27,6 +30,8 @@ class Stamp(enum.Enum):
     """Further from the others than the window: the estimator's own door decides."""
     STARTED_AGAIN = enum.auto()
     """The stamps went back and go on from there (a bag that loops, a simulation reset): reset, then use the message."""
+    WENT_AHEAD = enum.auto()
+    """They jumped ahead, while this computer's clock did not, and go on from there (a clock was set): worth a word."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +108,7 @@ class StampMonitor:
         self._newest = stamp
         self._stamps.append(stamp)
         self._delays.append(arrival - stamp)
-        return Stamp.STARTED_AGAIN if back else Stamp.IN_ORDER
+        return Stamp.STARTED_AGAIN if back else Stamp.WENT_AHEAD
 
     def timing(self, now: int) -> Timing:
         """Delay, spread, rate and silence at `now` (node's clock)."""
@@ -140,12 +145,14 @@ def clock_complaints(monitors: Iterable[StampMonitor], now: int, tolerance: floa
     if delays:
         (least, quickest), (most, slowest) = min(delays), max(delays)
         if most - least > tolerance:
+            where = f"messages on {slowest} arrive {_delay_text(most)}, on {quickest} {_delay_text(least)}"
+            if least > LONG_AGO:
+                where = f"the stamps on {slowest} are that much further behind their arrival than those on {quickest}"
             found.append(
-                f"sensor clocks differ by {_duration(most - least)}: messages on {slowest} arrive "
-                f"{_delay_text(most)}, on {quickest} {_delay_text(least)}; synchronise the clocks, or set the "
+                f"sensor clocks differ by {_duration(most - least)}: {where}; synchronise the clocks, or set the "
                 "time_offset of the topic"
             )
-        elif least > 10.0 or most < -tolerance:
+        elif least > LONG_AGO or most < -tolerance:
             found.append(
                 f"all messages arrive {_delay_text(statistics.median(delay for delay, _ in delays))}: when they are "
                 "played from a recording or come from a simulator, publish /clock and set use_sim_time; otherwise set "

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import TwistWithCovarianceStamped
-from sensor_msgs.msg import NavSatFix
+from sensor_msgs.msg import NavSatFix, NavSatStatus
 
 from eskf_ros.filter.layout import STREAM_NAMES, Verdict
+from eskf_ros.gnss.point_solution import PointSolution, SolutionStatus
 from eskf_ros.simulate.map_frame import MapFrame
 
 SECOND = 1_000_000_000
+
+GOOD_VERDICTS = (Verdict.FUSED, Verdict.WEIGHED_DOWN, Verdict.DUPLICATE, Verdict.DISABLED)
+"""Nothing is wrong with what got one of these."""
 
 
 def set_header(header: Any, stamp: int, frame: str) -> None:
@@ -28,7 +33,7 @@ def key_values(values: dict[str, object]) -> list[KeyValue]:
 
 
 def bias_message(row: np.void, frame: str) -> TwistWithCovarianceStamped:
-    """Biases in IMU axes: linear m/s2 of the accelerometer, angular rad/s of the gyro, with their variances."""
+    """Biases in the axes of the IMU, whose frame it is: linear m/s2 of the accelerometer, angular rad/s of the gyro."""
     message = TwistWithCovarianceStamped()
     set_header(message.header, int(row["stamp"]), frame)
     linear, angular = message.twist.twist.linear, message.twist.twist.angular
@@ -43,19 +48,36 @@ def fix_message(row: np.void, datum: tuple[float, float, float], frame: str) -> 
     """The position of base_link as NavSatFix, covariance in east, north, up of the map."""
     message = NavSatFix()
     set_header(message.header, int(row["stamp"]), frame)
+    message.status.status = NavSatStatus.STATUS_FIX
     message.latitude, message.longitude, message.altitude = MapFrame(datum).to_geodetic_deg(row["position_map"])
     message.position_covariance = np.ascontiguousarray(row["pose_covariance"][:3, :3]).ravel()
     message.position_covariance_type = NavSatFix.COVARIANCE_TYPE_KNOWN
     return message
 
 
+def solution_message(solution: PointSolution, stamp: int, frame: str) -> NavSatFix:
+    """The position of the antenna by the ranges of one epoch alone, in the frame of the message they came in."""
+    message = NavSatFix()
+    set_header(message.header, stamp, frame)
+    if solution.status != SolutionStatus.SOLVED:
+        message.status.status = NavSatStatus.STATUS_NO_FIX
+        message.latitude = message.longitude = message.altitude = math.nan
+        return message
+    latitude, longitude, message.altitude = map(float, solution.geodetic)
+    message.status.status = NavSatStatus.STATUS_FIX
+    message.latitude, message.longitude = math.degrees(latitude), math.degrees(longitude)
+    message.position_covariance = np.ascontiguousarray(solution.covariance_enu, np.float64).ravel()
+    message.position_covariance_type = NavSatFix.COVARIANCE_TYPE_KNOWN
+    return message
+
+
 def record_statuses(records: np.ndarray, stamp: Time) -> DiagnosticArray:
-    """One status per measurement: what became of it, final."""
+    """One status per measurement: what became of it, and which receiver it is from (0 the first)."""
     message = DiagnosticArray()
     message.header.stamp = stamp
     for record in records:
         verdict = Verdict(int(record["verdict"]))
-        good = verdict in (Verdict.FUSED, Verdict.DUPLICATE)
+        good = verdict in GOOD_VERDICTS
         message.status.append(
             DiagnosticStatus(
                 level=DiagnosticStatus.OK if good else DiagnosticStatus.WARN,
@@ -63,6 +85,7 @@ def record_statuses(records: np.ndarray, stamp: Time) -> DiagnosticArray:
                 message=verdict.name.lower(),
                 values=key_values(
                     {
+                        "receiver": int(record["source"]),
                         "stamp": f"{int(record['stamp']) // SECOND}.{int(record['stamp']) % SECOND:09d}",
                         "nis": float(record["nis"]),
                         "dof": int(record["dof"]),

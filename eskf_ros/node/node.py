@@ -10,18 +10,20 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import TwistWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 from rclpy.clock import Clock, ClockType
+from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
 
-from eskf_ros.filter.layout import Status, Verdict
+from eskf_ros.filter.layout import Status, Stream, Verdict
 from eskf_ros.filter.navigator import Navigator, compile_kernels
 from eskf_ros.filter.warm_start import Memory
-from eskf_ros.inputs import Input
+from eskf_ros.gnss.rinex import RinexError
+from eskf_ros.inputs import Input, uses_ranges
 from eskf_ros.node import robot_localization, transforms
 from eskf_ros.node.cdr import ImuReader, ImuSample, imu_from_message
 from eskf_ros.node.clocks import SECOND, Stamp, StampMonitor
@@ -29,10 +31,13 @@ from eskf_ros.node.declare import LiveParameters, declare, unused_overrides
 from eskf_ros.node.extrinsics import IMU, Extrinsics, place_of
 from eskf_ros.node.inputs import AidInput, open_inputs
 from eskf_ros.node.memory import read_memory, write_memory
-from eskf_ros.node.messages import bias_message, fix_message, record_statuses
+from eskf_ros.node.messages import bias_message, fix_message, record_statuses, solution_message
 from eskf_ros.node.outputs import OUTPUT_QOS, OVERRIDING, Outputs
+from eskf_ros.node.poses import set_pose
 from eskf_ros.node.status import status_report
-from eskf_ros.parameters import Parameters
+from eskf_ros.node.trouble import Trouble
+from eskf_ros.parameters import ParameterError, Parameters
+from eskf_ros.ranges.intake import RangeIntake, compile_ranges
 
 INPUT_DEPTH = 1000
 """A second of a fast IMU: what may wait while the computer is busy elsewhere."""
@@ -49,17 +54,20 @@ class EskfNode(Node):
     A message that cannot be used is counted and named in the diagnostics; it never ends the node.
     """
 
-    def __init__(self) -> None:
-        super().__init__("eskf_node")
+    def __init__(self, context: Context | None = None) -> None:
+        super().__init__("eskf_node", context=context)
         self.parameters = declare(self)
         self.navigator = Navigator(self.parameters)
-        self.trouble: dict[str, int] = {}
+        self.trouble = Trouble(self.get_logger().error)
         self.verdicts: dict[tuple[int, Verdict], int] = {}
         self.resets = 0
-        self.longest_callback = 0.0
+        self.latest_fixes: dict[Verdict, int] = {}
+        self.callbacks, self.callback_time, self.longest_callback = 0, 0.0, 0.0
+        self._restarts = 0
         self.extrinsics = Extrinsics(self.parameters)
         self._frames_met: set[tuple[str, str]] = set()
         self._imu_frames_met: set[bytes] = set()
+        self._imu_frame = ""
         self._is_judging = False
         self._is_simulated = bool(self.get_parameter("use_sim_time").value)
         self._reports = 0
@@ -67,29 +75,34 @@ class EskfNode(Node):
         self._compile()
         self._live = LiveParameters(self, self.parameters, self._configure)
 
-        self.outputs = Outputs(self, self.parameters, self.note_trouble)
-        self._filtered = self.create_publisher(NavSatFix, "gps/filtered", OUTPUT_QOS)
-        self._bias = self.create_publisher(TwistWithCovarianceStamped, "imu/bias", OUTPUT_QOS)
-        self._aids = self.create_publisher(DiagnosticArray, "eskf/aids", OUTPUT_QOS)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", OUTPUT_QOS)
+        self.outputs = Outputs(self, self.parameters, self.trouble.note)
+        self._filtered = self._publisher(NavSatFix, "gps/filtered")
+        self._bias = self._publisher(TwistWithCovarianceStamped, "imu/bias")
+        self._aids = self._publisher(DiagnosticArray, "eskf/aids")
+        self._diagnostics = self._publisher(DiagnosticArray, "/diagnostics")
+        self.output_publishers = (*self.outputs.publishers, self._filtered, self._bias, self._aids, self._diagnostics)
 
         self._imu_reader = ImuReader()
-        topic = self.parameters.topics.imu
-        self.imu_monitor = StampMonitor(self.resolve_topic_name(topic), self.parameters.history.window)
+        topics = self.parameters.topics
+        self.imu_monitor = StampMonitor(self.resolve_topic_name(topics.imu), self.parameters.history.window)
         self.aid_inputs = open_inputs(self.parameters, self.resolve_topic_name)
-        self.inputs: list[tuple[Any, Input | None]] = [
-            (self._subscribe(Imu, topic, INPUT_DEPTH, self._on_imu, "imu"), None)
-        ]
+        self.range_intake = self._open_ranges()
+        self.inputs: list[tuple[Any, Input | None]] = []
+        self._subscribe(Imu, topics.imu, input_qos(INPUT_DEPTH), self._on_imu, "imu")
         for source in self.aid_inputs:
-            kind, callback = source.kind, partial(self._on_aid, source, source.kind.push_of(self.navigator))
-            subscription = self._subscribe(source.message_class, source.name, kind.depth, callback, kind.name)
-            self.inputs.append((subscription, kind))
+            callback = partial(self._on_aid, source, source.kind.push_of(self.navigator, self.range_intake))
+            quality = input_qos(source.kind.depth)
+            self._subscribe(source.message_class, source.name, quality, callback, source.kind.name, source.kind)
+        # A command is not one of many samples: it must not get lost, and the tools that send it are reliable.
+        self._subscribe(
+            PoseWithCovarianceStamped, topics.initial_pose, QoSProfile(depth=1), self._on_initial_pose, "initial_pose"
+        )
         self._transform_input: Any = None
         self._open_transform_inputs()
         self.create_service(Trigger, "~/reset", self._served(self._on_reset))
         self.create_service(Trigger, "~/set_datum_here", self._served(self._on_set_datum_here))
         if robot_localization.services is not None:
-            robot_localization.RobotLocalizationServices(self, self.navigator)
+            robot_localization.RobotLocalizationServices(self, self.navigator, self.parameters.frames.map)
         # Not on the clock of the node: a simulation that has not begun is worth a report too.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(REPORT_PERIOD, self._contained(self._report, "report"), clock=steady)
@@ -107,25 +120,32 @@ class EskfNode(Node):
         self._contained(self._report, "report")()
         self._contained(self._write_memory, "warm_start.file")()
 
-    def note_trouble(self, text: str) -> None:
-        """Count a kind of trouble, and log it the first time."""
-        if text not in self.trouble and len(self.trouble) < 100:
-            self.get_logger().error(text)
-            self.trouble[text] = 0
-        if text in self.trouble:
-            self.trouble[text] += 1
-
     def _compile(self) -> None:
         """Have every kernel compiled before the first message comes: from the cache, or anew for half a minute."""
         self.get_logger().info("starting the estimator; the first start after an installation compiles it (a minute)")
         compile_kernels()
+        if uses_ranges(self.parameters):
+            compile_ranges(self.parameters)
         fix_message(self.navigator.odometry[0], (0.0, 0.0, 0.0), "")
 
-    def _subscribe(self, kind: Any, topic: str, depth: int, callback: Callable[..., None], name: str) -> Any:
+    def _publisher(self, kind: Any, topic: str) -> Any:
+        return self.create_publisher(kind, topic, OUTPUT_QOS, qos_overriding_options=OVERRIDING)
+
+    def _subscribe(
+        self,
+        message_class: Any,
+        topic: str,
+        quality: QoSProfile,
+        callback: Callable[..., None],
+        name: str,
+        kind: Input | None = None,
+    ) -> None:
         # All come serialised: a message that cannot be read fails in our callback, not in the executor.
-        return self.create_subscription(
-            kind, topic, self._contained(callback, name), input_qos(depth), raw=True, qos_overriding_options=OVERRIDING
+        contained = self._contained(callback, name)
+        subscription = self.create_subscription(
+            message_class, topic, contained, quality, raw=True, qos_overriding_options=OVERRIDING
         )
+        self.inputs.append((subscription, kind))
 
     def _contained(self, callback: Callable[..., None], name: str) -> Callable[..., None]:
         """Let no message and no mistake of ours end the node: count it by name, log it, go on."""
@@ -134,7 +154,7 @@ class EskfNode(Node):
             try:
                 callback(*arguments)
             except Exception as error:
-                self.note_trouble(f"{name}: {type(error).__name__}: {error}")
+                self.trouble.note(f"{name}: {type(error).__name__}: {error}")
 
         return contain
 
@@ -156,7 +176,8 @@ class EskfNode(Node):
         for source in self.aid_inputs:
             source.configure(self.parameters)
 
-    def _now(self) -> int:
+    def now(self) -> int:
+        """Time of the node's clock (ns)."""
         # The clock of the node costs more than the filter; without simulated time it is the system's.
         return int(self.get_clock().now().nanoseconds) if self._is_simulated else time.time_ns()
 
@@ -174,11 +195,14 @@ class EskfNode(Node):
         if sample is None:
             sample = imu_from_message(deserialize_message(data, Imu))
         stamp, specific_force, angular_rate, frame = sample
-        judgement = self.imu_monitor.note(stamp, self._now())
+        judgement = self.imu_monitor.note(stamp, self.now())
         if judgement == Stamp.STARTED_AGAIN:
             self._reset(f"the stamps of {self.imu_monitor.topic} went back")
+        elif judgement == Stamp.WENT_AHEAD:
+            self.get_logger().warn(f"the stamps of {self.imu_monitor.topic} went ahead of this computer's clock")
         if frame not in self._imu_frames_met:
-            self._meet_frame(self._imu_frames_met, frame, IMU, frame.decode(errors="replace"))
+            self._imu_frame = frame.decode(errors="replace")
+            self._meet_frame(self._imu_frames_met, frame, IMU, self._imu_frame)
         if judgement == Stamp.ZERO:
             return
         if self._memory is not None:
@@ -188,10 +212,24 @@ class EskfNode(Node):
             self.outputs.publish(rows, index)
         if self._is_judging:
             self._tell_verdicts()
-        self.longest_callback = max(self.longest_callback, time.perf_counter() - started)
+        took = time.perf_counter() - started
+        self.callbacks += 1
+        self.callback_time += took
+        if took > self.longest_callback:
+            self.longest_callback = took
 
-    def _on_aid(self, source: AidInput, push: Callable[..., None], data: bytes) -> None:
-        arrival = self._now()
+    def _open_ranges(self) -> RangeIntake | None:
+        """Make ready for ranges, if GNSS is used by them."""
+        if not uses_ranges(self.parameters):
+            return None
+        self._solutions = self._publisher(NavSatFix, "gnss/point_solution")
+        try:
+            return RangeIntake(self.navigator, self.parameters)
+        except RinexError as error:
+            raise ParameterError("ranges.rinex_nav_files", [str(error)]) from error
+
+    def _on_aid(self, source: AidInput, push: Callable[..., Any], data: bytes) -> None:
+        arrival = self.now()
         batch = source.read(data, arrival)
         frame = batch.strings[int(batch.messages["frame_id"][0])]
         receiver = source.receiver(frame)
@@ -199,39 +237,55 @@ class EskfNode(Node):
             place = place_of(source.kind.name, receiver)
             self._meet_frame(self._frames_met, (source.kind.name, frame), place, frame)
         stamp = int(batch.messages["stamp"][0])
-        if source.monitors[receiver].note(stamp and stamp + source.offset(receiver), arrival) == Stamp.ZERO:
-            return
+        if source.kind.is_timed:
+            moved = stamp and stamp + source.offset(receiver)
+            if source.monitors[receiver].note(moved, arrival) == Stamp.ZERO:
+                return
         for arguments in source.arguments(batch):
-            push(*arguments)
+            solution = push(*arguments)
+            if solution is not None:
+                self._solutions.publish(solution_message(solution, stamp, frame))
             self._is_judging = True
 
     def _tell_verdicts(self) -> None:
-        """Publish what became of the measurements up to the newest sample; later messages may still change it."""
-        records = self.navigator.take_live()
-        if len(records):
-            self._aids.publish(record_statuses(records, self.get_clock().now().to_msg()))
+        """Publish what became of the measurements up to the newest sample; later messages may still change it.
+
+        Somebody who begins to listen is told what the history holds.
+        """
+        if self._aids.get_subscription_count():
+            records = self.navigator.take_live()
+            if len(records):
+                self._aids.publish(record_statuses(records, self.get_clock().now().to_msg()))
         self._is_judging = self.navigator.waiting > 0
 
     def _report(self) -> None:
         """Once a second: final verdicts, biases, filtered fix, diagnostics, other publishers of our transforms."""
         self._is_simulated = bool(self.get_parameter("use_sim_time").value)
         records = self.navigator.take_records()
-        for record in records:
-            key = (int(record["stream"]), Verdict(int(record["verdict"])))
-            self.verdicts[key] = self.verdicts.get(key, 0) + 1
+        fixes: dict[Verdict, int] = {}
+        for stream, verdict in zip(records["stream"].tolist(), map(Verdict, records["verdict"].tolist())):
+            self.verdicts[stream, verdict] = self.verdicts.get((stream, verdict), 0) + 1
+            if stream == Stream.GNSS_POSITION:
+                fixes[verdict] = fixes.get(verdict, 0) + 1
+        self.latest_fixes = fixes or self.latest_fixes
         stamp = self.get_clock().now().to_msg()
         refused = records[records["verdict"] == Verdict.OUTSIDE_HISTORY]
         if len(refused):
             self._aids.publish(record_statuses(refused, stamp))
         row, datum = self.navigator.odometry[0], self.navigator.datum
         if row["status"] == Status.FAULT:
-            self.note_trouble("the estimate is not finite: call the service ~/reset")
+            self.trouble.note("the estimate is not finite: call the service ~/reset")
         else:
-            self._bias.publish(bias_message(row, self.parameters.frames.base_link))
+            self._bias.publish(bias_message(row, self._imu_frame))
             if row["position_known"] and datum is not None:
                 self._filtered.publish(fix_message(row, datum, self.parameters.frames.base_link))
+        if self.navigator.restarts > self._restarts:
+            self.get_logger().warn("the alignment began again: the IMU was silent, or fix after fix was rejected")
+        self._restarts = self.navigator.restarts
         self._diagnostics.publish(status_report(self, stamp))
-        self.longest_callback = 0.0
+        if self.range_intake is not None:
+            self.range_intake.wants_solution = self._solutions.get_subscription_count() > 0
+        self.callbacks, self.callback_time, self.longest_callback = 0, 0.0, 0.0
         self._watch_transforms()
         self._reports += 1
 
@@ -243,6 +297,18 @@ class EskfNode(Node):
         if self.navigator.set_datum_here():
             return True, "the map begins at the present position"
         return False, "the position is not known yet"
+
+    def _on_initial_pose(self, data: bytes) -> None:
+        message = deserialize_message(data, PoseWithCovarianceStamped)
+        frame, expected = message.header.frame_id, self.parameters.frames.map
+        if frame != expected:
+            why = f"its frame is {frame!r}, not {expected!r}"
+        else:
+            why = set_pose(self.navigator, message.pose)
+        if why:
+            self.trouble.note(f"{self.parameters.topics.initial_pose}: not used: {why}")
+        else:
+            self.get_logger().info(f"{self.parameters.topics.initial_pose}: the estimate was put there")
 
     def _open_transform_inputs(self) -> None:
         """Listen to static transforms for the places of the sensors, and to another node's odom -> base_link."""

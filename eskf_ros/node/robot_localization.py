@@ -13,7 +13,7 @@ import numpy as np
 from rclpy.node import Node
 
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.node.transforms import yaw_of
+from eskf_ros.node.poses import set_pose
 from eskf_ros.simulate.map_frame import MapFrame
 
 try:
@@ -28,9 +28,10 @@ class RobotLocalizationServices:
     The responses carry no success flag: where there is no answer yet the numbers are NaN, and the log says why.
     """
 
-    def __init__(self, node: Node, navigator: Navigator) -> None:
+    def __init__(self, node: Node, navigator: Navigator, map_frame: str) -> None:
         self._node = node
         self._navigator = navigator
+        self._map = map_frame
         for kind, name, answer in (
             (services.FromLL, "fromLL", self._from_geodetic),
             (services.ToLL, "toLL", self._to_geodetic),
@@ -83,21 +84,9 @@ class RobotLocalizationServices:
         return response
 
     def _set_pose(self, request: Any, response: Any) -> Any:
-        pose = request.pose.pose
-        why = set_pose(self._navigator, pose)
+        frame = request.pose.header.frame_id
+        why = f"the frame is {frame!r}, not {self._map}" if frame not in ("", self._map) else ""
+        why = why or set_pose(self._navigator, request.pose.pose)
         if why:
             self._node.get_logger().error(f"set_pose: {why}")
         return response
-
-
-def set_pose(navigator: Navigator, pose: Any) -> str:
-    """Put the estimate to a geometry_msgs/PoseWithCovariance in map; returns why not, or nothing."""
-    p, q = pose.pose.position, pose.pose.orientation
-    covariance = np.reshape(pose.covariance, (6, 6))
-    numbers = [p.x, p.y, p.z, q.w, q.x, q.y, q.z]
-    variances = np.diagonal(covariance)[[0, 1, 2, 5]]
-    if not np.isfinite(numbers).all() or not np.isfinite(covariance).all() or (variances <= 0.0).any():
-        return "the pose is not finite, or its covariance has no positive variance for x, y, z and yaw"
-    if navigator.set_pose((p.x, p.y, p.z), covariance[:3, :3], yaw_of(q.w, q.x, q.y, q.z), math.sqrt(variances[3])):
-        return ""
-    return "the robot is not levelled yet, or the origin of the map is not known"

@@ -12,7 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from eskf_ros.filter.layout import STREAM_NAMES, Status, Stream
+from eskf_ros.filter.layout import STREAM_NAMES, Status
 from eskf_ros.node.clocks import StampMonitor, clock_complaints
 from eskf_ros.node.messages import key_values
 
@@ -27,16 +27,20 @@ SILENCE = 3.0
 
 
 def status_report(node: EskfNode, stamp: Time) -> DiagnosticArray:
-    """One status: OK when the state is GOOD and nothing is wrong, ERROR when only a reset helps."""
-    now = node.get_clock().now().nanoseconds
+    """One status: OK when the state is GOOD and nothing is wrong, ERROR when nothing is published any more."""
+    now = node.now()
     row = node.navigator.odometry[0]
     status = Status(int(row["status"]))
-    problems = [*node.navigator.complaints, *clock_complaints(node.monitors, now)]
-    problems += [*mismatches(node), *second_publishers(node)]
-    problems += [f"{text} ({count} times)" for text, count in node.trouble.items()]
-    waiting = waiting_for(node, status, now)
+    is_silent = status > Status.WAITING_IMU and bool(missing(node, [node.imu_monitor], now))
+    if is_silent and status != Status.FAULT:
+        # Whatever the estimate was worth: nothing is published without the IMU.
+        status = Status.WAITING_IMU
+    ranges = [] if node.range_intake is None else node.range_intake.complaints
+    problems = [*node.navigator.complaints, *ranges, *clock_complaints(node.monitors, now)]
+    problems += [*mismatches(node), *second_publishers(node), *node.trouble.problems()]
+    waiting = waiting_for(node, status, row, now)
     level = DiagnosticStatus.OK if status == Status.GOOD and not problems else DiagnosticStatus.WARN
-    if status == Status.FAULT:
+    if status == Status.FAULT or is_silent:
         level = DiagnosticStatus.ERROR
     report = DiagnosticArray()
     report.header.stamp = stamp
@@ -52,9 +56,9 @@ def status_report(node: EskfNode, stamp: Time) -> DiagnosticArray:
     return report
 
 
-def waiting_for(node: EskfNode, status: Status, now: int) -> list[str]:
+def waiting_for(node: EskfNode, status: Status, row: np.void, now: int) -> list[str]:
     """What keeps the state from the next rung."""
-    fixes = next(source for source in node.aid_inputs if source.kind.stream == Stream.GNSS_POSITION).monitors
+    fixes = next(source for source in node.aid_inputs if source.kind.name in ("gnss_fix", "ranges")).monitors
     if status in (Status.WAITING_IMU, Status.LEVELLING):
         return missing(node, [node.imu_monitor], now) or ["standing still or driving steadily for a moment"]
     if status == Status.FAULT:
@@ -62,11 +66,22 @@ def waiting_for(node: EskfNode, status: Status, now: int) -> list[str]:
     if status == Status.DEGRADED:
         return ["fixes that agree with the estimate: see eskf/aids"]
     if status in (Status.WAITING_FIX, Status.COASTING):
-        return missing(node, fixes, now) or ["fixes come, but none was accepted lately: see eskf/aids"]
+        return missing(node, fixes, now) or [f"fixes come, but none was accepted lately{latest_verdicts(node)}"]
     if status == Status.WAITING_HEADING:
         way = "speeding up, braking or turning tells the heading, a constant velocity does not"
         return missing(node, fixes, now) or [way]
+    if status == Status.ALIGNING:
+        std, wanted = math.degrees(math.sqrt(row["pose_covariance"][5, 5])), node.parameters.alignment
+        wanted_std = wanted.good_heading_std_deg
+        return [f"a heading to {wanted_std:g} deg, which is known to {std:.1f} deg: drive, speed up, brake, turn"]
     return []
+
+
+def latest_verdicts(node: EskfNode) -> str:
+    """What became of the fixes of the last report that has some."""
+    counts = node.latest_fixes
+    told = ", ".join(f"{count} {verdict.name.lower()}" for verdict, count in sorted(counts.items()))
+    return f" (the last: {told}): see eskf/aids" if told else ": see eskf/aids"
 
 
 def missing(node: EskfNode, monitors: Sequence[StampMonitor], now: int) -> list[str]:
@@ -77,7 +92,21 @@ def missing(node: EskfNode, monitors: Sequence[StampMonitor], now: int) -> list[
     topic = monitors[0].topic
     publishers = node.count_publishers(topic)
     since = f"no message for {min(silences):.0f} s" if silences else "no message"
-    return [f"{since} on {topic}; {publishers} publisher{'' if publishers == 1 else 's'}"]
+    return [f"{since} on {topic}; {publishers} publisher{'' if publishers == 1 else 's'}{elsewhere(node, topic)}"]
+
+
+def elsewhere(node: EskfNode, topic: str) -> str:
+    """Where else messages of the type of an input are published, if nobody publishes them on its topic."""
+    if node.count_publishers(topic):
+        return ""
+    kind = next(type_name(subscription.msg_type) for subscription, _ in node.inputs if subscription.topic_name == topic)
+    own = {subscription.topic_name for subscription, _ in node.inputs}
+    others = [
+        name
+        for name, types in node.get_topic_names_and_types()
+        if kind in types and name not in own and node.count_publishers(name)
+    ]
+    return f" ({kind} is published on {', '.join(others[:3])})" if others else ""
 
 
 def mismatches(node: EskfNode) -> list[str]:
@@ -97,7 +126,7 @@ def mismatches(node: EskfNode) -> list[str]:
                 reason = "is volatile, this node was told to ask for transient local (qos_overrides)"
             if reason:
                 found.append(f"the publisher {node_name(other)} of {subscription.topic_name} {reason}")
-    for publisher in node.outputs.publishers:
+    for publisher in node.output_publishers:
         offered = publisher.qos_profile
         for other in node.get_subscriptions_info_by_topic(publisher.topic_name):
             reason = ""
@@ -149,16 +178,18 @@ def figures(node: EskfNode, row: np.void) -> dict[str, object]:
         "datum": node.navigator.datum,
         "window needed (s)": node.navigator.window_needed,
         "history (kB)": node.navigator.held_bytes // 1024,
+        "callback (ms)": f"{1e3 * node.callback_time / max(1, node.callbacks):.3f}",
         "longest callback (ms)": f"{1e3 * node.longest_callback:.2f}",
         **{f"place of the {sensor}": node.extrinsics.source_of(sensor) for sensor in node.extrinsics.sensors},
     }
 
 
 def counters(node: EskfNode) -> dict[str, object]:
-    """Measurements by stream and final verdict, IMU samples by what became of them."""
+    """Measurements by stream and final verdict, IMU samples by what became of them, trouble by kind."""
     found: dict[str, object] = {
         f"{STREAM_NAMES[stream]} {verdict.name.lower()}": count for (stream, verdict), count in node.verdicts.items()
     }
+    found.update({f"trouble: {kind}": count for kind, count in node.trouble.counts.items()})
     found.update({f"imu {name}": count for name, count in node.navigator.imu_counts.items()})
     return found
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.gnss.cloud import CloudError, Epoch, read_epoch
+from eskf_ros.gnss.cloud import CloudError, Epoch, read_epoch, write_epoch
 from eskf_ros.gnss.ephemeris import Ephemerides
 from eskf_ros.gnss.ephemeris_cloud import read_ephemerides
 from eskf_ros.gnss.measurements import Masks, measured_epoch
 from eskf_ros.gnss.point_solution import PointSettings, PointSolution, SolutionStatus, solve
 from eskf_ros.gnss.range_files import read_navigation_files
 from eskf_ros.gnss.range_model import NO_KLOBUCHAR
-from eskf_ros.gnss.ranges import Status, locate, one_per_satellite
+from eskf_ros.gnss.ranges import (
+    CODE_VALID,
+    DOPPLER_VALID,
+    SATELLITE_KNOWN,
+    Status,
+    allocate_ranges,
+    locate,
+    one_per_satellite,
+)
 from eskf_ros.gnss.signals import Gnss
 from eskf_ros.parameters import Parameters
 
@@ -49,8 +58,9 @@ class RangeIntake:
 
     Attributes:
         epochs: epochs that were read.
-        solved: epochs of which a point solution was made (mode loose with ``ranges.use_point_solution``).
+        solved: epochs of which a point solution was made.
         refused: messages that could not be read, by reason.
+        wants_solution: make a point solution of every epoch, in mode tight too.
     """
 
     def __init__(self, navigator: Navigator, parameters: Parameters) -> None:
@@ -69,6 +79,7 @@ class RangeIntake:
         self.epochs = 0
         self.solved = 0
         self.refused: Counter[str] = Counter()
+        self.wants_solution = False
 
     def take_ephemerides(self, stamp: int, points: NDArray[Any], arrival: int = 0) -> None:
         """Add the points of a message of `gnss/ephemerides`; they serve the ranges that come after them."""
@@ -97,22 +108,28 @@ class RangeIntake:
             self.refused["ranges: signals beyond the first 200 of an epoch"] += epoch.left_out
         self.epochs += 1
         if self._solves:
-            return self._push_solution(stamp, epoch, arrival)
+            solution = self._solution(epoch)
+            self._navigator.range_statuses.update(Status(status) for status in epoch.ranges["status"].tolist())
+            self._push_solution(stamp + round(self._time_offset * 1e9), solution, arrival)
+            return solution
         instant = (epoch.week, epoch.seconds)
         signals = measured_epoch(epoch.ranges, *instant, self._ephemerides, masks=self._masks)
         self._navigator.push_ranges(stamp, instant, signals, self._klobuchar, arrival)
-        return None
+        return self._solution(epoch) if self.wants_solution else None
 
-    def _push_solution(self, stamp: int, epoch: Epoch, arrival: int) -> PointSolution:
-        """Give position and velocity of the epoch alone to the navigator, as a receiver would."""
+    def _solution(self, epoch: Epoch) -> PointSolution:
+        """Solve the epoch alone, as a receiver would."""
         locate(epoch.ranges, epoch.week, epoch.seconds, self._ephemerides)
-        self._navigator.range_statuses.update(Status(status) for status in epoch.ranges["status"].tolist())
         ranges, klobuchar = one_per_satellite(epoch.ranges), self._klobuchar
         solution = solve(ranges, epoch.week, epoch.seconds, klobuchar, self._point_settings, self._last)
-        stamp += round(self._time_offset * 1e9)
         if solution.status == SolutionStatus.SOLVED:
             self.solved += 1
             self._last = solution.position_ecef
+        return solution
+
+    def _push_solution(self, stamp: int, solution: PointSolution, arrival: int) -> None:
+        """Give position and velocity of a point solution to the navigator."""
+        if solution.status == SolutionStatus.SOLVED:
             latitude, longitude, altitude = solution.geodetic
             self._navigator.push_gnss_position(
                 stamp,
@@ -127,7 +144,6 @@ class RangeIntake:
         if solution.velocity_status == SolutionStatus.SOLVED:
             covariance = solution.velocity_covariance_enu.ravel()
             self._navigator.push_gnss_velocity(stamp, solution.velocity_enu.tolist(), covariance, arrival)
-        return solution
 
     @property
     def complaints(self) -> list[str]:
@@ -143,3 +159,19 @@ class RangeIntake:
                     + (f": {remedy}" * bool(remedy))
                 )
         return found
+
+
+def compile_ranges(parameters: Parameters) -> None:
+    """Compile all that a `RangeIntake` calls, or load it from the cache, with an epoch of five satellites."""
+    parameters = replace(parameters, ranges=replace(parameters.ranges, rinex_nav_files=""))
+    trial = RangeIntake(Navigator(parameters), parameters)
+    trial.wants_solution = True
+    antenna = np.array([6.378e6, 0.0, 0.0])
+    ranges = allocate_ranges(5)
+    ranges["sv_id"], ranges["signal"] = np.arange(1, 6), 0
+    ranges["satellite"] = antenna + 2e7 * np.array([(1, 0, 0), (1, 1, 0), (1, -1, 0), (1, 0, 1), (1, 0, -1)])
+    ranges["pseudorange"] = np.linalg.norm(ranges["satellite"] - antenna, axis=1)
+    for name in ("satellite_velocity", "satellite_clock", "satellite_clock_drift", "doppler"):
+        ranges[name] = 0.0
+    ranges["flags"] = CODE_VALID | DOPPLER_VALID | SATELLITE_KNOWN
+    trial.take_ranges(1_000_000_000, write_epoch(ranges, 2200, 0.0, satellites=True))
