@@ -67,24 +67,43 @@ class Variant:
 
 
 NOISES = (Variant("chosen noise"), Variant("default noise", chosen_noise=False))
-INPUTS = (Variant("position only", ("gnss.use_velocity: false",)), Variant("with velocity"))
-TSUKISHIMA = (
-    Variant("position only", ("gnss.use_velocity: false",)),
-    Variant("position only, default noise", ("gnss.use_velocity: false",), chosen_noise=False),
-    Variant("with velocity"),
-    Variant("with velocity, default noise", chosen_noise=False),
-)
+POSITION = "gnss.use_velocity: false"
+NO_WHEEL = "wheel.use: false"
+NHC = ("nhc.enabled: true", *tsukishima.REAR_AXLE)
 CORRELATED = "gnss.correlation_time: 30.0"
+TIGHT = ("mode: tight", f"ranges.time_offset: {tsukishima.TIME_OFFSET}")
+STREET_MASKS = ("ranges.cn0_mask: 38.0", "ranges.elevation_mask_deg: 25.0")
+
+INPUTS = (Variant("position only", (POSITION,)), Variant("with velocity"))
+TSUKISHIMA = (
+    Variant("position only", (POSITION, NO_WHEEL)),
+    Variant("position only, default noise", (POSITION, NO_WHEEL), chosen_noise=False),
+    Variant("position, NHC", (POSITION, NO_WHEEL, *NHC)),
+    Variant("position, wheel", (POSITION, *NHC[2:])),
+    Variant("position, wheel, NHC", (POSITION, *NHC)),
+    Variant("with velocity", (NO_WHEEL,)),
+    Variant("with velocity, default noise", (NO_WHEEL,), chosen_noise=False),
+    Variant("with velocity, wheel, NHC", NHC),
+)
+TSUKISHIMA_RANGES = (
+    Variant("loose, position only", (POSITION, NO_WHEEL)),
+    Variant("loose, with velocity", (NO_WHEEL,)),
+    Variant("loose, with velocity, correlated errors", (NO_WHEEL, CORRELATED)),
+    Variant("tight", (*TIGHT, NO_WHEEL)),
+    Variant("tight, masks for streets", (*TIGHT, *STREET_MASKS, NO_WHEEL)),
+    Variant("tight, masks for streets, wheel, NHC", (*TIGHT, *STREET_MASKS, *NHC)),
+)
 RANGES = (
-    Variant("loose, position only", ("gnss.use_velocity: false",)),
+    Variant("loose, position only", (POSITION,)),
     Variant("loose, with velocity"),
-    Variant("loose, with velocity, correlated errors", (CORRELATED,)),
+    Variant("tight", TIGHT[:1]),
 )
 HUSKY = (
-    Variant("default noise", chosen_noise=False),
-    Variant("chosen noise"),
-    Variant("heading given, default noise", husky.HEADING, chosen_noise=False),
-    Variant("heading given, chosen noise", husky.HEADING),
+    Variant("as installed", (NO_WHEEL,), chosen_noise=False),
+    Variant("chosen noise", (NO_WHEEL,)),
+    Variant("chosen noise, heading given", (NO_WHEEL, *husky.HEADING)),
+    Variant("chosen noise, heading given, wheel", husky.HEADING),
+    Variant("chosen noise, heading given, wheel, NHC", ("nhc.enabled: true", *husky.HEADING)),
 )
 NAGOYA_GRADES = ("consumer", "industrial", "tactical")
 KNOWN_HEADING_DEG = 30.0
@@ -179,7 +198,7 @@ def tsukishima_figures(folder: Path) -> str:
     window = [
         east_north_row(f"{variant.label}{label}", replay_with_outages(with_ranges, variant, (), truth))
         for truth, label in (("truth", ""), ("truth_shifted", ", constant removed"))
-        for variant in RANGES
+        for variant in TSUKISHIMA_RANGES
     ]
     return (
         f"Between fixes one second apart:\n\n{table(HEADINGS, rows)}\n"

@@ -151,7 +151,7 @@ def test_drive_0708_with_default_noise_is_never_lost(drive_0708: Callable[[bool]
 def test_tsukishima_is_never_lost_among_wrong_fixes(tmp_path: Path, data_folder: Callable[[str], Path]) -> None:
     recording = tsukishima_recording(tmp_path, data_folder("tsukishima_20201105"))
     for lines, rms, most in ((("gnss.use_velocity: false",), 0.22, 6.8), ((), 0.17, 2.4)):
-        summary = replayed(recording, *lines)
+        summary = replayed(recording, "wheel.use: false", *lines)
         assert_never_lost(summary)
         assert summary["truth"]["compared"] > 4200
         assert_within(summary, "horizontal", rms=rms, p50=0.075, p95=0.33, max=most)

@@ -28,6 +28,7 @@ INSTALLATION = """\
 /**:
   ros__parameters:
     topics.gnss_fix: fix
+    topics.wheel: husky_velocity_controller/odom
     imu.mount_position: [0.0, -0.3, 0.52]
     imu.mount_rpy_deg: [90.0, 0.0, -90.0]
 """
@@ -37,6 +38,9 @@ NOISE = """\
     imu.gyro_noise_density: 5.0e-3
     imu.accel_noise_density: 0.1
     imu.gyro_bias_std: 0.002
+    # Fixes wander by much more than they claim.
+    gnss.covariance_scale: 10.0
+    gnss.correlation_time: 30.0
 """
 
 HEADING = ("alignment.initial_heading_deg: 115.0", "alignment.initial_heading_std_deg: 20.0")

@@ -58,6 +58,8 @@ INSTALLATION = f"""\
 /**:
   ros__parameters:
     imu.mount_rpy_deg: [180.0, 0.0, 0.0]
+    # The iron in the aeroplane is stronger than the horizontal field, and nobody has calibrated it.
+    mag.use: false
     gnss.time_offset: {TIME_OFFSET}
 """
 

@@ -7,15 +7,17 @@ Clocks, by correlation, fixed once:
 - GNSS time is 17.88 s (+-0.01) ahead of the IMU: smallest median difference between yaw rate and change of the course
   of the Doppler velocity above 3 m/s. GNSS stamps are UTC (leap seconds 18), so they are 0.12 s early.
 - It is 17.34 s (+-0.02) ahead of the wheel speed: smallest median difference to the Doppler speed. The wheel speed is
-  0.54 s older than the IMU sample of the same row. 5.09 pulses are a metre; steps are 0.2 m/s.
+  0.54 s older than the IMU sample of the same row. 5.09 pulses are a metre. The speed has steps of 0.2 m/s; they last
+  longer than 20 ms, and one sample in five is given.
 
 Axes: IMU x right, y forward, z up, found by the accelerations along the course and the sign of the turns. Over 5 m/s
-and straight ahead the velocity of the estimate lies 2.3 deg above the IMU's y axis and 0.3 deg to the right of it.
+and straight ahead the velocity of the estimate lies 2.3 deg above the IMU's y axis and 0.3 deg to the right of it. In
+turns it moves sideways by 0.9 to 1.3 m times the yaw rate: so far behind the antenna is the rear axle.
 
-RTK calls 7233 of 8851 epochs fixed and claims 2 cm, but between the buildings many are wrong by metres: one step in
-twenty from one fixed epoch to the next differs by over 0.4 m from what the wheels measured. Truth are fixed epochs in
-runs of at least five seconds in which every step agrees with the wheels within 0.25 m and changes the height by less
-than 0.25 m: 5457 epochs.
+RTK calls 7233 of 8851 epochs fixed and claims 4 to 16 mm, but among the buildings many are wrong by metres: one step
+in twenty from one fixed epoch to the next is over 0.4 m off what the wheels measured. Truth are fixed epochs in runs of
+at least five seconds in which every step agrees with the wheels within 0.25 m and changes the height by less than
+0.25 m: 5457 epochs.
 
 Raw measurements (GPS and QZSS on L1, five times a second) cover the first 853 s; satellites, their clocks and the
 troposphere are applied by the authors. No parameters of the ionosphere came with them. Our point solutions lie 2.3 m
@@ -94,6 +96,8 @@ NOISE = """\
     imu.gyro_noise_density: 7.0e-4
 """
 
+REAR_AXLE = ("wheel.position: [-1.2, 0.0, 0.0]", "nhc.position: [-1.2, 0.0, 0.0]")
+
 RANGES_NOISE = """\
     imu.accel_bias_std: 0.5
     imu.accel_bias_random_walk: 1.0e-3
@@ -127,7 +131,7 @@ def tsukishima_recording(folder: Path, source: Path) -> Recording:
             velocity_std[whole],
             velocity_time[whole] + TIME_OFFSET + GNSS_LATENCY,
         ),
-        wheel(time, speed, WHEEL_STD, time),
+        wheel(time[::5], speed[::5], WHEEL_STD, time[::5]),
         truth_fix(fixes[confirmed & ~given], TIME_OFFSET),
     )
     return Recording(bag, INSTALLATION, NOISE)
@@ -156,7 +160,7 @@ def tsukishima_ranges_recording(folder: Path, source: Path) -> Recording:
         gnss_velocity(velocity_time, velocity, velocity_std, velocity_time + TIME_OFFSET + GNSS_LATENCY),
         gnss_ranges(epochs, epochs.time + TIME_OFFSET + GNSS_LATENCY),
         gnss_ephemerides(time[0], read_navigation(source / "base.nav").broadcasts),
-        wheel(time[during], speed[during], WHEEL_STD, time[during]),
+        wheel(time[during][::5], speed[during][::5], WHEEL_STD, time[during][::5]),
         truth_fix(truth, TIME_OFFSET),
         truth_fix(shifted(truth, shift), TIME_OFFSET, "truth_shifted"),
     )
