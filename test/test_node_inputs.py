@@ -115,7 +115,9 @@ def test_clouds_reach_the_navigator_as_in_the_replay() -> None:
 
     ranges = allocate_ranges(4)
     ranges["sv_id"], ranges["signal"] = np.arange(1, 5), 0
-    ranges["satellite"] = np.random.default_rng(3).normal(0.0, 2e7, (4, 3))
+    ranges["satellite"] = 2.6e7 * np.eye(4, 3) + (1e5, 2e5, 3e5)
+    ranges["satellite"][3] = 1.5e7
+    ranges["satellite_velocity"], ranges["satellite_clock_drift"] = 1000.0, 0.0
     ranges["pseudorange"], ranges["doppler"], ranges["satellite_clock"] = 2.3e7, 100.0, 1e-4
     ranges["flags"] = CODE_VALID | DOPPLER_VALID | SATELLITE_KNOWN
     points = write_epoch(ranges, 2300, 1000.0, satellites=True)

@@ -74,7 +74,10 @@ def test_tight_from_the_recording(folder: Path) -> None:
     # What models leave of atmosphere and orbits changes in half an hour: it stays.
     assert result["error"]["horizontal"]["p50"] < 2.5
     assert result["error"]["speed"]["p50"] < 0.1
+    assert 0.3 < result["nees"]["position"]["mean"] < 8.0
     assert result["warnings"] == []
+    unmodelled = with_parameters(folder, "ranges:", "  correlation_time: 0.0")
+    assert replay(folder / "ranges.mcap", *TIGHT, config=unmodelled)["nees"]["position"]["mean"] > 12.0
 
 
 def test_the_mode_is_a_parameter_too(folder: Path) -> None:
@@ -139,6 +142,15 @@ def test_missing_ephemerides_are_named_with_the_remedy(folder: Path) -> None:
     with_file = replay(bare, *TIGHT, "--nav", str(SKY))
     assert with_file["final"]["status"] == "GOOD"
     assert with_file["warnings"] == []
+
+
+def test_missing_parameters_of_the_ionosphere_are_named(folder: Path) -> None:
+    bare = folder / "no_ionosphere.nav"
+    lines = SKY.read_text(encoding="ascii").splitlines(keepends=True)
+    bare.write_text("".join(line for line in lines if "IONOSPHERIC" not in line), encoding="ascii")
+    result = replay(folder / "plain.mcap", "--ranges", str(folder / "rover.obs"), "--nav", str(bare))
+    assert any("ionosphere" in line for line in result["warnings"])
+    assert result["error"]["horizontal"]["p50"] < 5.0
 
 
 def test_what_does_not_fit_is_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

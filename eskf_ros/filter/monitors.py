@@ -8,7 +8,10 @@ import numpy as np
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import STANDARD_GRAVITY
+from eskf_ros.filter.layout import Stream
 from eskf_ros.rotation import dot, rotate, wrapped
+
+MAG = int(Stream.MAG)
 
 NO_GRAVITY = 0.5
 """Below this part of gravity on average the accelerometer cannot be a strapdown one in m/s2, at rest or not."""
@@ -62,9 +65,17 @@ def note_contrast(sums, angle):
 
 @njit
 def watch_heading(state, aid, work):
-    """Compare a yaw of the dual antenna, described by ``work``, with the estimate."""
+    """Compare a heading of the dual antenna or the magnetometer, described by ``work``, with the estimate."""
     if aid.source == 0 and state.heading_known == 1 and aid.payload[3] > 0.0:
-        note_contrast(state.heading_contrast, work.innovation[0])
+        kind = 1 if aid.stream == MAG else 0
+        note_contrast(state.heading_contrast[kind], work.innovation[0])
+
+
+@njit
+def watch_field(state, is_disturbed):
+    """Count the readings of the magnetometer that cannot be the Earth's field; the counts forget."""
+    state.fields = MEMORY * state.fields + 1.0
+    state.disturbed_fields = MEMORY * state.disturbed_fields + (1.0 if is_disturbed else 0.0)
 
 
 @njit
@@ -88,14 +99,29 @@ def _lasting_difference(sums: np.ndarray) -> float | None:
 
 def _heading_complaints(state: np.void) -> list[str]:
     found = []
-    difference = _lasting_difference(state["heading_contrast"])
+    if state["disturbed_fields"] > max(LASTING_COUNT, ALIKE * float(state["fields"])):
+        strength, inclination = (float(value) for value in state["field_found"])
+        found.append(
+            f"the magnetic field is {strength * 1e6:.0f} uT and dips by {math.degrees(inclination):.0f} deg, that of "
+            f"the Earth is {float(state['field_strength']) * 1e6:.0f} uT and dips by "
+            f"{math.degrees(state['field_inclination']):.0f} deg: does mag.mount_rpy_deg match its axes (a driver may "
+            "give north-east-down), is it in T, and is it calibrated?"
+        )
+    dual_antenna, magnetometer = state["heading_contrast"]
+    difference = _lasting_difference(magnetometer)
+    if difference is not None:
+        found.append(
+            f"the headings of the magnetometer differ from the estimate by {difference:.0f} deg: does "
+            "mag.mount_rpy_deg match its axes (a driver may give north-east-down), and is it calibrated?"
+        )
+    difference = _lasting_difference(dual_antenna)
     if difference is not None:
         found.append(
             f"the headings of the dual antenna differ from the estimate by {difference:.0f} deg: are the antennas "
             "swapped, does heading.mount_rpy_deg match the baseline, and is yaw 0 = east, counter-clockwise?"
         )
     difference = _lasting_difference(state["course_contrast"])
-    if difference is not None and state["heading_contrast"][2] > 0.0:
+    if difference is not None and dual_antenna[2] > 0.0:
         found.append(
             f"the vehicle travels at {difference:.0f} deg to the heading of the dual antenna: are the antennas "
             "swapped, does heading.mount_rpy_deg match the baseline, and is yaw 0 = east, counter-clockwise? "

@@ -38,7 +38,8 @@ def watch_solution(state, aid, settings):
     """Begin again with the lasting error of the fixes when the receiver changes its kind of solution."""
     variance = aid.payload[3] + aid.payload[6]
     last = state.last_fix_variance[aid.source]
-    if settings.position_error_at < state.error_size and max(variance, last) > SAME_SOLUTION * min(variance, last):
+    lasts = settings.position_error_at < state.error_size and settings.correlated_share > 0.0
+    if lasts and max(variance, last) > SAME_SOLUTION * min(variance, last):
         renew(state, settings.position_error_at, 3, settings)
     state.last_fix_variance[aid.source] = variance
 

@@ -19,7 +19,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
 
-from eskf_ros.filter.layout import Status, Stream, Verdict
+from eskf_ros.filter.layout import STREAM_NAMES, Status, Stream, Verdict
 from eskf_ros.filter.navigator import Navigator, compile_kernels
 from eskf_ros.filter.warm_start import Memory
 from eskf_ros.gnss.rinex import RinexError
@@ -270,6 +270,9 @@ class EskfNode(Node):
         self.latest_fixes = fixes or self.latest_fixes
         stamp = self.get_clock().now().to_msg()
         refused = records[records["verdict"] == Verdict.OUTSIDE_HISTORY]
+        for stream in np.unique(refused["stream"]).tolist():
+            window = self.parameters.history.window
+            self.trouble.note(f"{STREAM_NAMES[stream]}: a message came too late for history.window = {window:g} s")
         if len(refused):
             self._aids.publish(record_statuses(refused, stamp))
         row, datum = self.navigator.odometry[0], self.navigator.datum

@@ -18,7 +18,6 @@ from eskf_ros.gnss.ephemeris_cloud import read_ephemerides
 from eskf_ros.gnss.measurements import Masks, measured_epoch
 from eskf_ros.gnss.point_solution import PointSettings, PointSolution, SolutionStatus, solve
 from eskf_ros.gnss.range_files import read_navigation_files
-from eskf_ros.gnss.range_model import NO_KLOBUCHAR
 from eskf_ros.gnss.ranges import (
     CODE_VALID,
     DOPPLER_VALID,
@@ -33,6 +32,14 @@ from eskf_ros.parameters import Parameters
 
 HORIZON = math.radians(-90.0)
 """No elevation mask: where the receiver is, only the filter knows."""
+
+DEFAULT_KLOBUCHAR = np.array(
+    [0.1118e-07, -0.7451e-08, -0.5961e-07, 0.1192e-06, 0.1167e06, -0.2294e06, -0.1311e06, 0.1049e07]
+)
+"""Broadcast on 1 January 2004, a year of middling solar activity: stands in where no parameters came (as in RTKLIB).
+
+Zeros would leave the whole delay, metres that differ from satellite to satellite.
+"""
 
 COVARIANCE_KNOWN = 3
 STATUS_FIX = 0
@@ -74,7 +81,7 @@ class RangeIntake:
         self._time_offset = parameters.ranges.time_offset
         files = read_navigation_files([Path(name) for name in parameters.ranges.rinex_nav_files.split(":") if name])
         self._ephemerides = Ephemerides(files.records)
-        self._klobuchar = files.klobuchar.get(Gnss.GPS, NO_KLOBUCHAR)
+        self._klobuchar = files.klobuchar.get(Gnss.GPS, DEFAULT_KLOBUCHAR)
         self._last: NDArray[np.float64] | None = None
         self.epochs = 0
         self.solved = 0
@@ -149,6 +156,10 @@ class RangeIntake:
     def complaints(self) -> list[str]:
         """What is wrong with the messages, one sentence each with what to do; empty when nothing is."""
         found = [f"{count} times: {reason}" for reason, count in self.refused.items()]
+        if self.epochs and self._klobuchar is DEFAULT_KLOBUCHAR:
+            found.append(
+                "no parameters of the ionosphere came with the ephemerides: those of a middling day stand in for them"
+            )
         statuses = self._navigator.range_statuses
         total = sum(statuses.values()) - statuses[Status.OTHER_SIGNAL]
         for status, count in statuses.items():
