@@ -39,6 +39,7 @@ from eskf_ros.filter.layout import (
     STATE,
     TIMELINE,
     WORK,
+    Phase,
     Status,
     Stream,
     Verdict,
@@ -50,13 +51,7 @@ from eskf_ros.filter.monitors import complaints, watch_course, watch_field, watc
 from eskf_ros.filter.optional import join
 from eskf_ros.filter.output import status_of, write_odometry
 from eskf_ros.filter.ranges import end_of_epoch, fuse_ranges, is_range, offer_signals
-from eskf_ros.filter.recovery import (
-    is_near_gate,
-    judge_filter,
-    judge_pressure,
-    update_weighed_down,
-    watch_solution,
-)
+from eskf_ros.filter.recovery import gate_of, phase_of, recover, watch_solution
 from eskf_ros.filter.settings import intakes_from, settings_from
 from eskf_ros.filter.stillness import add_to_block, watch_wheels
 from eskf_ros.filter.strapdown import SECOND, propagate
@@ -73,8 +68,10 @@ from eskf_ros.filter.timeline import (
     save_checkpoint,
     take_final,
 )
+from eskf_ros.filter.track import follow
 from eskf_ros.filter.update import update
 from eskf_ros.filter.warm_start import Memory, recall
+from eskf_ros.filter.wheel_heading import search_with_wheels
 from eskf_ros.gnss.measurements import MEASURED_SIGNAL
 from eskf_ros.gnss.range_model import NO_KLOBUCHAR
 from eskf_ros.gnss.ranges import Status as RangeStatus
@@ -108,6 +105,9 @@ IMU_BATCH = 1024
 
 HIGHEST_ALTITUDE = 1e5
 """What no receiver on a robot reports (m)."""
+
+ORIENTATION_SHARE = SECOND // 20
+"""Of each second so much (ns) of what the IMU says of its orientation is used."""
 
 DIAGONAL = np.eye(3).ravel()
 
@@ -162,7 +162,9 @@ def predict(state, stamp, sample, settings, work):
     if state.level_known == 0:
         return
     if sample.stamp - state.imu_stamp > LONGEST_GAP:
+        position = (state.position_map[0], state.position_map[1], state.position_map[2])
         restart(state)
+        note_jump(state, position, heading_of(state, settings), settings)
         return
     propagate(state, stamp, sample, settings, work)
 
@@ -208,6 +210,9 @@ def fuse(state, aids, i, settings, work):
         note_velocity(state, aid, settings)
         watch_course(state, aid, heading_of(state, settings), settings)
     if not is_aligned_for(state, aid.stream):
+        if aid.stream == WHEEL:
+            search_with_wheels(state, aid.payload, settings.gate[WHEEL, 2], settings, work)
+            watch_wheels(state, aid)
         aid.verdict = BEFORE_ALIGNMENT if aid.stream < FIRST_CONSTRAINT else INACTIVE
         return
     if aid.stream == HEADING and aid.source == heading.IMU_ORIENTATION and state.heading_known == 1:
@@ -219,9 +224,8 @@ def fuse(state, aids, i, settings, work):
         start_position(state, aid.payload)
         recall_heading(state, aid.payload, settings)
     join(state, settings.reach[aid.stream], settings)
-    if aid.stream == GNSS_POSITION:
-        watch_solution(state, aid, settings)
-    elif aid.stream == MAG:
+    watch_solution(state, aid, settings)
+    if aid.stream == MAG:
         mag.note_way(state, heading_before, settings)
         is_disturbed = mag.is_disturbed(state, aid, settings)
         watch_field(state, is_disturbed)
@@ -239,23 +243,19 @@ def fuse(state, aids, i, settings, work):
                 aid.verdict = BEFORE_ALIGNMENT
                 return
             size = linearize(state, aid, settings, work)
-    gate = settings.gate[aid.stream, size]
     for k in range(size):
         aid.innovation[k] = work.innovation[k]
     aid.dof = size
+    follow(state, aid, work)
+    gate = gate_of(state, aid, size, settings)
     aid.verdict, aid.nis = update(state, size, gate, work)
-    if aid.stream == GNSS_POSITION and is_near_gate(aid.verdict, aid.nis, gate):
-        linearize(state, aid, settings, work)
-        aid.verdict = update_weighed_down(state, size, aid.nis / gate, work)
+    recover(state, aid, size, gate, settings, work)
     if aid.verdict == FUSED and state.heading_known == 0:
         search_heading(state, aid, gate, settings, work)
     if aid.stream == GNSS_POSITION:
-        judge_filter(state, aid.verdict)
         mag.note_field(state, aid)
     elif aid.stream == WHEEL:
         watch_wheels(state, aid)
-    elif aid.stream == BARO:
-        judge_pressure(state, aid.verdict, settings)
     note_jump(state, position, heading_before, settings)
 
 
@@ -350,7 +350,6 @@ class Navigator:
         self.range_statuses: Counter[RangeStatus] = Counter()
         """What became of the signals before they entered the timeline: how many are usable, and why others are not."""
         self._field_problem = ""
-        self._orientation_second = -1
 
     def warm_start(self, memory: Memory, age: float) -> None:
         """Offer what an earlier run knew, ``age`` seconds ago; to be called before the first sample."""
@@ -559,7 +558,8 @@ class Navigator:
     def push_imu_orientation(self, stamps: StampArray, orientation: FloatArray, covariance: FloatArray) -> None:
         """Take what samples of `push_imu` say of the IMU's orientation: (n, 4) x y z w and (n, 9) rad2, as in REP-145.
 
-        Nothing happens unless ``alignment.imu_orientation`` asks for it; then one sample a second is enough.
+        Nothing happens unless ``alignment.imu_orientation`` asks for it; then the first few of each second are enough:
+        which these are must not depend on the order in which they come.
         """
         alignment = self.parameters.alignment
         if alignment.imu_orientation == "unused":
@@ -567,9 +567,8 @@ class Navigator:
         forward_imu = self._settings["imu_to_base"][0, 0]
         for i in np.flatnonzero(covariance[:, 0] != ABSENT):
             stamp = int(stamps[i])
-            if stamp // SECOND <= self._orientation_second:
+            if stamp % SECOND >= ORIENTATION_SHARE:
                 continue
-            self._orientation_second = stamp // SECOND
             x, y, z, w = (float(value) for value in orientation[i])
             yaw = math.nan
             if abs(x * x + y * y + z * z + w * w - 1.0) < 0.1:
@@ -669,6 +668,15 @@ class Navigator:
         return int(self._states["restarts"][0])
 
     @property
+    def position_resets(self) -> int:
+        """How often fixes that agree with each other won over the filter: position and velocity were reset to them."""
+        return int(self._states["resets"][0])
+
+    def phase(self, stream: Stream, source: int = 0) -> Phase:
+        """Return what an aid is to the filter at the moment; ``source``: which receiver."""
+        return Phase(phase_of(self._states[0], int(stream), source))
+
+    @property
     def complaints(self) -> list[str]:
         """What is wrong with whole streams, one sentence each with what to do; empty when nothing is."""
         found = complaints(self._states[0])
@@ -737,7 +745,7 @@ class Navigator:
             found, inclination, strength = declination, 0.0, 0.0
         if math.isnan(declination):
             declination = found
-        self._offered[0]["payload"][mag.FIELD :] = (1.0, declination, inclination, strength)
+        self._offered[0]["payload"][mag.FIELD : mag.FIELD + 4] = (1.0, declination, inclination, strength)
 
     def _push_gnss(self, stream: Stream, stamp: int, arrival: int, frame_id: str) -> None:
         """Sort the record that is on offer into the timeline, as one of the receiver with this frame."""
@@ -755,6 +763,8 @@ class Navigator:
         aid = self._offered[0]
         aid["source"] = source
         aid["stamp"], aid["arrival"], aid["stream"], aid["verdict"] = stamp, arrival, stream, aid["door"]
+        # So it stays in the record of a measurement that waits in vain.
+        aid["dof"], aid["nis"], aid["innovation"] = 0, math.nan, math.nan
         self._make_room()
         refused = insert_aid(self._aids, self._timeline, self._offered)
         if refused:
@@ -816,6 +826,7 @@ def compile_kernels() -> None:
     trial.take_records()
     trial.odometry  # noqa: B018 - asked for its side effect
     trial.status  # noqa: B018
+    trial.phase(Stream.GNSS_POSITION)
     trial._forget()
     trial.take_live()
     trial.set_datum(0.0, 0.0, 0.0)
