@@ -330,7 +330,12 @@ class Navigator:
             recall(*self._memory, parameters, self._settings[0])
 
     def reset(self) -> None:
-        """Forget everything, the datum too unless it is a parameter; records that were not taken are lost."""
+        """Forget everything, the datum too unless it is a parameter, and what an earlier run knew.
+
+        Records that were not taken are lost.
+        """
+        self._memory = None
+        self._settings["has_memory"] = 0
         self._blank = blank_state()
         if self.parameters.datum:
             latitude, longitude, altitude = self.parameters.datum
@@ -682,12 +687,6 @@ class Navigator:
         found = complaints(self._states[0])
         if self._field_problem:
             found.append(self._field_problem)
-        if self._stand_ins:
-            found.append(
-                f"{self._stand_ins} messages came without a covariance (unknown type or all zero): "
-                "gnss.status_std_horizontal, gnss.status_std_vertical and the unknown_..._std of the parameters stand "
-                "in for it"
-            )
         for stream, difference in self._stamp_difference.items():
             if 2 * self._refused_count[stream] > self._offered_count[stream]:
                 found.append(
@@ -696,6 +695,17 @@ class Navigator:
                     "time_offset of the stream"
                 )
         return found
+
+    @property
+    def notes(self) -> list[str]:
+        """What is worth knowing of the streams though nothing is wrong: one sentence each."""
+        if not self._stand_ins:
+            return []
+        return [
+            f"{self._stand_ins} messages came without a covariance (unknown type or all zero): "
+            "gnss.status_std_horizontal, gnss.status_std_vertical and the unknown_..._std of the parameters stand in "
+            "for it"
+        ]
 
     @property
     def held_bytes(self) -> int:
