@@ -99,11 +99,12 @@ RANGES = (
     Variant("tight", TIGHT[:1]),
 )
 HUSKY = (
-    Variant("as installed", (NO_WHEEL,), chosen_noise=False),
-    Variant("chosen noise", (NO_WHEEL,)),
-    Variant("chosen noise, heading given", (NO_WHEEL, *husky.HEADING)),
-    Variant("chosen noise, heading given, wheel", husky.HEADING),
-    Variant("chosen noise, heading given, wheel, NHC", ("nhc.enabled: true", *husky.HEADING)),
+    Variant("without wheels", (NO_WHEEL,), chosen_noise=False),
+    Variant("without wheels, chosen noise", (NO_WHEEL,)),
+    Variant("without wheels, chosen noise, heading given", (NO_WHEEL, *husky.HEADING)),
+    Variant("wheels", chosen_noise=False),
+    Variant("wheels, chosen noise"),
+    Variant("wheels, chosen noise, NHC", ("nhc.enabled: true",)),
 )
 NAGOYA_GRADES = ("consumer", "industrial", "tactical")
 KNOWN_HEADING_DEG = 30.0
