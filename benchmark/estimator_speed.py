@@ -111,7 +111,8 @@ def tight_microseconds(recording: Recording, start: int) -> tuple[float, float]:
         began = time.perf_counter()
         navigator.push_ranges(int(stamp), instant, signals)
         navigator.update()
-        per_signal = min(per_signal, (time.perf_counter() - began) / len(signals))
+        if navigator.state["heading_known"][0]:
+            per_signal = min(per_signal, (time.perf_counter() - began) / len(signals))
         if last > start:
             break
     best = np.inf

@@ -108,8 +108,8 @@ def feed(recording: Recording, navigator: Navigator, stops: NDArray[np.int64]) -
                 float(recording.fix_longitude_deg[fix]),
                 float(recording.fix_altitude[fix]),
                 recording.fix_covariance[fix],
-                covariance_type=3,
-                status=0,
+                int(recording.fix_covariance_type[fix]),
+                int(recording.fix_status[fix]),
                 arrival=int(recording.fix_arrival[fix]),
             )
             fix += 1

@@ -167,6 +167,32 @@ def test_the_second_antenna_is_found_on_tf_static(make):
 
 
 @needs_ros
+def test_a_place_found_in_time_restarts_nothing_and_one_found_late_does(make, start):
+    """A barometer whose first message comes late is placed at once; an antenna that was taken for base_link is not."""
+    from test_node_frames import Rotation, transform
+    from test_node_inputs import serialised
+
+    pressure = serialised("sensor_msgs/msg/FluidPressure", "baro", stamp=start[-1][0])
+    inside = make("-p", "gnss.lever_arm:=[0.0, 0.0, 0.0]")
+    inside.node._on_static_transforms(
+        SimpleNamespace(transforms=[transform("base_link", "baro", (0.0, 0.5, 0.2), Rotation.identity())])
+    )
+    inside.play(start)
+    inside.give("baro", pressure)
+    assert inside.node.parameters.baro.position == (0.0, 0.5, 0.2)
+    inside.report()
+    assert inside.values["resets"] == "0"
+    assert inside.values["place of the barometer"] == "/tf_static"
+    assert inside.values["place of the GNSS antenna"] == "taken to be base_link"
+    inside.node._on_static_transforms(
+        SimpleNamespace(transforms=[transform("base_link", "gps", (1.0, 0.0, 2.0), Rotation.identity())])
+    )
+    assert inside.node.parameters.gnss.lever_arm == (1.0, 0.0, 2.0)
+    inside.report()
+    assert inside.values["resets"] == "1"
+
+
+@needs_ros
 def test_velocities_of_another_type(make, drive):
     """TwistStamped in place of TwistWithCovarianceStamped: fused, with the stand-in for the covariance."""
     from rclpy.serialization import deserialize_message, serialize_message

@@ -169,6 +169,7 @@ def test_a_fix_errs_by_what_lasts_and_what_is_new(seed: int) -> None:
 
 def fix_with_std(std: float) -> Any:
     aid = allocate(AID)[0]
+    aid["stream"] = Stream.GNSS_POSITION
     aid["payload"][[3, 6, 8]] = std**2
     return aid
 

@@ -172,3 +172,6 @@ def test_every_signal_has_its_row(folder: Path) -> None:
     lines = (folder / "out" / "ranges_eskf" / "aids.csv").read_text().splitlines()[1:]
     names = [line.split(",")[2] for line in lines]
     assert names.count(Stream.PSEUDORANGE.name.lower()) == names.count(Stream.RANGE_RATE.name.lower()) > 1000
+    sources = {line.split(",")[-1] for line in lines}
+    assert {source[0] for source in sources} == set("GEC")
+    assert {source[3:] for source in sources if source[0] == "G"} == {" 1C"}

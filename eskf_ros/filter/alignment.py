@@ -37,6 +37,7 @@ from eskf_ros.filter.layout import (
 )
 from eskf_ros.filter.monitors import watch_input
 from eskf_ros.filter.strapdown import gravity_map
+from eskf_ros.filter.track import forget_tracks
 from eskf_ros.filter.warm_start import do_biases_hold
 from eskf_ros.rotation import (
     cross,
@@ -152,6 +153,7 @@ def move_datum(state, latitude, longitude, altitude, settings):
         lasting[0], lasting[1], lasting[2] = rotate(turn, (lasting[0], lasting[1], lasting[2]))
     turn_attitude(state, to_rotation_vector(from_matrix(turn)))
     forget_search(state)
+    forget_tracks(state)
 
 
 @njit
@@ -179,8 +181,10 @@ def restart(state):
     """Start the alignment again; only the datum stays."""
     state.restarts += 1
     forget_search(state)
+    forget_tracks(state)
     state.hint_count = 0
     state.rejected_fixes = 0
+    state.recent_resets = 0
     state.level_known = 0
     state.position_known = 0
     state.heading_known = 0
@@ -191,7 +195,6 @@ def restart(state):
     for i in range(2):
         state.clock_known[i] = 0
     for i in range(3):
-        state.jump_position[i] -= state.position_map[i]
         state.position_map[i] = 0.0
         state.velocity_map[i] = 0.0
 
@@ -537,6 +540,7 @@ def place(state, position, position_covariance, heading, heading_std, settings):
             covariance[VELOCITY + i, VELOCITY + i] = START_VELOCITY_STD**2
     state.position_known = 0
     forget_search(state)
+    forget_tracks(state)
     set_heading(state, heading, heading_std, settings)
     m = settings.imu_position_base
     offset = rotate(to_matrix(state.attitude), rotate_back(settings.imu_to_base, (m[0], m[1], m[2])))

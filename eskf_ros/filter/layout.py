@@ -78,10 +78,27 @@ class Status(IntEnum):
     FAULT = 8
 
 
+class Phase(IntEnum):
+    """What an aid is to the filter (see ``recovery``).
+
+    SUSPICIOUS: the latest measurements were rejected. OUTAGE: none came for a while. REACQUIRING: they come, but none
+    was accepted for a while, or not for long yet. RESET: a short while ago they won over the filter.
+    """
+
+    WAITING = 0
+    FUSING = 1
+    SUSPICIOUS = 2
+    OUTAGE = 3
+    REACQUIRING = 4
+    RESET = 5
+
+
 class Verdict(IntEnum):
     """What became of an offered measurement (a closed list; files show the names in lower case).
 
     INACTIVE is for constraints that do not hold at the moment, such as rest while the robot moves: it leaves no record.
+    CONTRADICTED: a position that moves otherwise than the velocity of the same receiver. RESET: it is the last of so
+    many rejected ones that agree with each other that the filter gave in.
     """
 
     WAITING = 0
@@ -99,6 +116,8 @@ class Verdict(IntEnum):
     WEIGHED_DOWN = 12
     INACTIVE = 13
     LOW_ELEVATION = 14
+    CONTRADICTED = 15
+    RESET = 16
 
 
 class Stream(IntEnum):
@@ -125,6 +144,9 @@ class Stream(IntEnum):
 STREAM_NAMES = tuple(stream.name.lower() for stream in Stream)
 
 CONSTRAINTS = (Stream.ZUPT, Stream.ZARU, Stream.NHC)
+
+SENSOR_STREAMS = int(min(CONSTRAINTS))
+"""So many streams, the first by rank, are those of sensors."""
 
 CONSTRAINT_INTERVAL = 1_000_000_000
 """The grid of the constraints (ns).
@@ -248,13 +270,39 @@ STATE = np.dtype(
         ("disturbed_stamp", "i8"),
         ("mag_heading", "f8"),
         ("mag_position", "f8", (3,)),
-        # When a pressure was last accepted.
-        ("baro_stamp", "i8"),
         # Tight coupling: whether the errors of clock bias and drift have values yet, milliseconds it has jumped by,
         # and how often most of the satellites contradicted the state.
         ("clock_known", "i8", (2,)),
         ("clock_jumps", "i8"),
         ("range_faults", "i8"),
+        # Recovery, by stream and source: last measurement and the usual interval, last accepted one and since when they
+        # are, rejected in a row.
+        ("aid_stamp", "i8", (SENSOR_STREAMS, SOURCES)),
+        ("aid_interval", "i8", (SENSOR_STREAMS, SOURCES)),
+        ("aid_fused_stamp", "i8", (SENSOR_STREAMS, SOURCES)),
+        ("aid_fused_since", "i8", (SENSOR_STREAMS, SOURCES)),
+        ("aid_rejected", "i8", (SENSOR_STREAMS, SOURCES)),
+        # The track of the fixes by receiver: where they are (m) and move (m/s) beside the reckoned position, which
+        # is the position without any correction, and variances per axis; misses and rejected members.
+        ("corrections_map", "f8", (3,)),
+        ("track_stamp", "i8", (SOURCES,)),
+        ("track_offset", "f8", (SOURCES, 3)),
+        ("track_rate", "f8", (SOURCES, 3)),
+        ("track_offset_variance", "f8", (SOURCES, 3)),
+        ("track_mixed_variance", "f8", (SOURCES, 3)),
+        ("track_rate_variance", "f8", (SOURCES, 3)),
+        ("track_misses", "i8", (SOURCES,)),
+        ("track_rejected", "i8", (SOURCES,)),
+        ("track_rejected_since", "i8", (SOURCES,)),
+        ("scatter", "f8", (SOURCES,)),
+        ("scatter_paid", "f8", (SOURCES,)),
+        # How far the velocities of the receiver lead away from the reckoned position (m), and how well that is known.
+        ("velocity_lead", "f8", (SOURCES, 3)),
+        ("velocity_lead_variance", "f8", (SOURCES, 3)),
+        # Resets of position and velocity, and when and how often lately.
+        ("resets", "i8"),
+        ("reset_stamp", "i8"),
+        ("recent_resets", "i8"),
     ],
     align=True,
 )
@@ -491,14 +539,16 @@ def allocate(dtype: np.dtype, count: int = 1) -> np.ndarray:
 
 
 _EVIDENCE = ("still_stamp", "motion_stamp", "last_fix_stamp", "anchor_stamp", "block_end", "wheel_stamp", "slip_stamp")
+_RECOVERY = ("aid_stamp", "aid_fused_stamp", "aid_fused_since", "track_stamp", "reset_stamp")
 
 
 def blank_state() -> np.ndarray:
     """Return the state before the first IMU sample."""
     state = allocate(STATE)
-    stamps = ("stamp", "imu_stamp", "first_stamp", "window_start", "absolute_stamp", "baro_stamp", "disturbed_stamp")
-    for field in (*stamps, *_EVIDENCE):
+    stamps = ("stamp", "imu_stamp", "first_stamp", "window_start", "absolute_stamp", "disturbed_stamp")
+    for field in (*stamps, *_EVIDENCE, *_RECOVERY):
         state[field] = NEVER
+    state["scatter"] = state["scatter_paid"] = 1.0
     state["attitude"][0, 0] = 1.0
     state["error_size"] = ERROR_SIZE
     # Until there are two samples: longer than any gap, so that the first interval takes no bend from an earlier one.

@@ -37,6 +37,7 @@ def note_jump(state, position, heading, settings):
     """Add how far a correction has moved the state from ``position`` (m) and ``heading`` (rad)."""
     for i in range(3):
         state.jump_position[i] += state.position_map[i] - position[i]
+        state.corrections_map[i] += state.position_map[i] - position[i]
     state.jump_heading += wrapped(heading_of(state, settings) - heading)
 
 

@@ -38,6 +38,7 @@ from eskf_ros.filter.layout import (
     STATE,
     TIMELINE,
     WORK,
+    Phase,
     Status,
     Stream,
     Verdict,
@@ -49,13 +50,7 @@ from eskf_ros.filter.monitors import complaints, watch_course, watch_field, watc
 from eskf_ros.filter.optional import join
 from eskf_ros.filter.output import status_of, write_odometry
 from eskf_ros.filter.ranges import end_of_epoch, fuse_ranges, is_range, offer_signals
-from eskf_ros.filter.recovery import (
-    is_near_gate,
-    judge_filter,
-    judge_pressure,
-    update_weighed_down,
-    watch_solution,
-)
+from eskf_ros.filter.recovery import gate_of, phase_of, recover, watch_solution
 from eskf_ros.filter.settings import intakes_from, settings_from
 from eskf_ros.filter.stillness import add_to_block, watch_wheels
 from eskf_ros.filter.strapdown import SECOND, propagate
@@ -71,6 +66,7 @@ from eskf_ros.filter.timeline import (
     save_checkpoint,
     take_final,
 )
+from eskf_ros.filter.track import follow
 from eskf_ros.filter.update import update
 from eskf_ros.filter.warm_start import Memory, recall
 from eskf_ros.filter.wheel_heading import search_with_wheels
@@ -162,7 +158,9 @@ def predict(state, stamp, sample, settings, work):
     if state.level_known == 0:
         return
     if sample.stamp - state.imu_stamp > LONGEST_GAP:
+        position = (state.position_map[0], state.position_map[1], state.position_map[2])
         restart(state)
+        note_jump(state, position, heading_of(state, settings), settings)
         return
     propagate(state, stamp, sample, settings, work)
 
@@ -222,9 +220,8 @@ def fuse(state, aids, i, settings, work):
         start_position(state, aid.payload)
         recall_heading(state, aid.payload, settings)
     join(state, settings.reach[aid.stream], settings)
-    if aid.stream == GNSS_POSITION:
-        watch_solution(state, aid, settings)
-    elif aid.stream == MAG:
+    watch_solution(state, aid, settings)
+    if aid.stream == MAG:
         mag.note_way(state, heading_before, settings)
         is_disturbed = mag.is_disturbed(state, aid, settings)
         watch_field(state, is_disturbed)
@@ -242,23 +239,19 @@ def fuse(state, aids, i, settings, work):
                 aid.verdict = BEFORE_ALIGNMENT
                 return
             size = linearize(state, aid, settings, work)
-    gate = settings.gate[aid.stream, size]
     for k in range(size):
         aid.innovation[k] = work.innovation[k]
     aid.dof = size
+    follow(state, aid, work)
+    gate = gate_of(state, aid, size, settings)
     aid.verdict, aid.nis = update(state, size, gate, work)
-    if aid.stream == GNSS_POSITION and is_near_gate(aid.verdict, aid.nis, gate):
-        linearize(state, aid, settings, work)
-        aid.verdict = update_weighed_down(state, size, aid.nis / gate, work)
+    recover(state, aid, size, gate, settings, work)
     if aid.verdict == FUSED and state.heading_known == 0:
         search_heading(state, aid, gate, settings, work)
     if aid.stream == GNSS_POSITION:
-        judge_filter(state, aid.verdict)
         mag.note_field(state, aid)
     elif aid.stream == WHEEL:
         watch_wheels(state, aid)
-    elif aid.stream == BARO:
-        judge_pressure(state, aid.verdict, settings)
     note_jump(state, position, heading_before, settings)
 
 
@@ -671,6 +664,15 @@ class Navigator:
         return int(self._states["restarts"][0])
 
     @property
+    def position_resets(self) -> int:
+        """How often fixes that agree with each other won over the filter: position and velocity were reset to them."""
+        return int(self._states["resets"][0])
+
+    def phase(self, stream: Stream, source: int = 0) -> Phase:
+        """Return what an aid is to the filter at the moment; ``source``: which receiver."""
+        return Phase(phase_of(self._states[0], int(stream), source))
+
+    @property
     def complaints(self) -> list[str]:
         """What is wrong with whole streams, one sentence each with what to do; empty when nothing is."""
         found = complaints(self._states[0])
@@ -739,7 +741,7 @@ class Navigator:
             found, inclination, strength = declination, 0.0, 0.0
         if math.isnan(declination):
             declination = found
-        self._offered[0]["payload"][mag.FIELD :] = (1.0, declination, inclination, strength)
+        self._offered[0]["payload"][mag.FIELD : mag.FIELD + 4] = (1.0, declination, inclination, strength)
 
     def _push_gnss(self, stream: Stream, stamp: int, arrival: int, frame_id: str) -> None:
         """Sort the record that is on offer into the timeline, as one of the receiver with this frame."""
@@ -820,6 +822,7 @@ def compile_kernels() -> None:
     trial.take_records()
     trial.odometry  # noqa: B018 - asked for its side effect
     trial.status  # noqa: B018
+    trial.phase(Stream.GNSS_POSITION)
     trial._forget()
     trial.take_live()
     trial.set_datum(0.0, 0.0, 0.0)

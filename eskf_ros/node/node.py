@@ -19,7 +19,8 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
 
-from eskf_ros.filter.layout import STREAM_NAMES, Status, Stream, Verdict
+from eskf_ros.compiled import while_compiling
+from eskf_ros.filter.layout import ODOMETRY, STREAM_NAMES, Status, Stream, Verdict, allocate
 from eskf_ros.filter.navigator import Navigator, compile_kernels
 from eskf_ros.filter.warm_start import Memory
 from eskf_ros.gnss.rinex import RinexError
@@ -32,6 +33,7 @@ from eskf_ros.node.extrinsics import IMU, Extrinsics, place_of
 from eskf_ros.node.inputs import AidInput, open_inputs
 from eskf_ros.node.memory import read_memory, write_memory
 from eskf_ros.node.messages import bias_message, fix_message, record_statuses, solution_message
+from eskf_ros.node.odometry import NUMBERS, fill_odometry
 from eskf_ros.node.outputs import OUTPUT_QOS, OVERRIDING, Outputs
 from eskf_ros.node.poses import set_pose
 from eskf_ros.node.status import status_report
@@ -43,6 +45,8 @@ INPUT_DEPTH = 1000
 """A second of a fast IMU: what may wait while the computer is busy elsewhere."""
 
 REPORT_PERIOD = 1.0
+PROGRESS_PERIOD = 5.0
+"""Seconds from one report to the next, and from one word about compiling to the next."""
 
 WATCH_EVERY = 10
 """Reports from one look for a second publisher of our transforms to the next."""
@@ -121,12 +125,23 @@ class EskfNode(Node):
         self._contained(self._write_memory, "warm_start.file")()
 
     def _compile(self) -> None:
-        """Have every kernel compiled before the first message comes: from the cache, or anew for half a minute."""
-        self.get_logger().info("starting the estimator; the first start after an installation compiles it (a minute)")
-        compile_kernels()
-        if uses_ranges(self.parameters):
-            compile_ranges(self.parameters)
-        fix_message(self.navigator.odometry[0], (0.0, 0.0, 0.0), "")
+        """Have every kernel compiled before the first message comes: from the cache, or anew for a minute."""
+        log = self.get_logger().info
+        log("starting the estimator; the first start after an installation compiles it, which takes a minute")
+        started = told = time.monotonic()
+
+        def tell(count: int) -> None:
+            nonlocal told
+            if time.monotonic() - told > PROGRESS_PERIOD:
+                told = time.monotonic()
+                log(f"compiling the estimator: {count} functions in {told - started:.0f} s")
+
+        with while_compiling(tell):
+            compile_kernels()
+            if uses_ranges(self.parameters):
+                compile_ranges(self.parameters)
+            fill_odometry(allocate(ODOMETRY), 0, False, np.zeros((2, NUMBERS)))
+            fix_message(self.navigator.odometry[0], (0.0, 0.0, 0.0), "")
 
     def _publisher(self, kind: Any, topic: str) -> Any:
         return self.create_publisher(kind, topic, OUTPUT_QOS, qos_overriding_options=OVERRIDING)
@@ -350,7 +365,7 @@ class EskfNode(Node):
     def _on_static_transforms(self, message: Any) -> None:
         for transform in message.transforms:
             self.extrinsics.note_transform(transform)
-        self._complete_extrinsics()
+        self._complete_extrinsics(is_late=True)
 
     def _meet_frame(self, met: set[Any], key: object, place: str, frame: str) -> None:
         """Take note of a frame name that an input has not used before."""
@@ -358,16 +373,17 @@ class EskfNode(Node):
             return
         met.add(key)
         if place:
-            self.extrinsics.note_frame(place, frame)
-            self._complete_extrinsics()
+            is_first = self.extrinsics.note_frame(place, frame)
+            self._complete_extrinsics(is_late=not is_first)
 
-    def _complete_extrinsics(self) -> None:
+    def _complete_extrinsics(self, is_late: bool) -> None:
+        """Use the places that can be found now; start again if earlier messages were taken for those of elsewhere."""
         found = self.extrinsics.find()
         for line in found:
             self.get_logger().info(line)
         if found:
             self._configure(self._live.current)
-            if self.navigator.status > Status.LEVELLING:
+            if is_late and self.navigator.status > Status.LEVELLING:
                 self._reset("the place of a sensor has become known")
 
     def _read_memory(self) -> Memory | None:

@@ -12,7 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from eskf_ros.filter.layout import STREAM_NAMES, Status
+from eskf_ros.filter.layout import STREAM_NAMES, Status, Stream
 from eskf_ros.node.clocks import StampMonitor, clock_complaints
 from eskf_ros.node.messages import key_values
 
@@ -174,6 +174,9 @@ def figures(node: EskfNode, row: np.void) -> dict[str, object]:
         "gyro bias (rad/s)": " ".join(f"{value:.6f}" for value in row["gyro_bias"]),
         "odometries published": node.outputs.published,
         "restarts": node.navigator.restarts,
+        "position resets": node.navigator.position_resets,
+        "fixes": node.navigator.phase(Stream.GNSS_POSITION).name,
+        "velocities": node.navigator.phase(Stream.GNSS_VELOCITY).name,
         "resets": node.resets,
         "datum": node.navigator.datum,
         "window needed (s)": node.navigator.window_needed,

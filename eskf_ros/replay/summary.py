@@ -3,8 +3,8 @@
 Stamps are integer ns, lengths m, times s; what is not known is null.
 
 - `duration_s`: from the first to the newest IMU stamp; `imu_count`: samples offered; `imu`: what became of them.
-  `restarts`: how often the alignment started again.
-- `aids.{name}`: `offered` measurements by their final verdict: `fused` (weighed_down ones too), `late`
+  `restarts`: how often the alignment started again; `position_resets`: how often fixes won over the filter.
+- `aids.{name}`: `offered` measurements by their final verdict: `fused` (weighed_down and reset too), `late`
   (outside_history), `rejected` (all other verdicts but waiting, which is for those newer than the last IMU sample); all
   of them in `verdicts`. `withheld` were
   not offered (--outage, --mode ins-only). `nis_mean` and `nis_in_95` are over all measurements that were tested, the
@@ -87,6 +87,7 @@ class Summary:
             "imu_count": self._feed.imu_count,
             "imu": navigator.imu_counts,
             "restarts": navigator.restarts,
+            "position_resets": navigator.position_resets,
             "wall_s": wall_s,
             "realtime_factor": duration / wall_s,
             "datum": None if navigator.datum is None else list(navigator.datum),
@@ -101,7 +102,7 @@ class Summary:
     def _aid(self, stream: Stream) -> dict[str, Any]:
         """`rejected` is every verdict but fused, waiting, and outside_history, which is `late`."""
         verdicts, tested = self._verdicts[stream], int(self._nis_count[stream])
-        fused = int(verdicts[Verdict.FUSED] + verdicts[Verdict.WEIGHED_DOWN])
+        fused = int(verdicts[Verdict.FUSED] + verdicts[Verdict.WEIGHED_DOWN] + verdicts[Verdict.RESET])
         late, waiting = int(verdicts[Verdict.OUTSIDE_HISTORY]), int(verdicts[Verdict.WAITING])
         offered = int(verdicts.sum())
         return {

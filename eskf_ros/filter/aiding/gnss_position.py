@@ -19,6 +19,9 @@ from eskf_ros.rotation import rotate, rotate_back, to_matrix
 
 SIZE = 3
 
+NOTABLE_SCATTER = 2.0
+"""Fixes whose scatter has more than so many times the variance they claim are not believed it."""
+
 
 @njit
 def position_of_fix(state, payload):
@@ -33,6 +36,12 @@ def predict(state, source, settings):
     """Return the map position (m) of the antenna of receiver ``source``: position + R lever_arm."""
     lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[source])
     return (state.position_map[0] + lever[0], state.position_map[1] + lever[1], state.position_map[2] + lever[2])
+
+
+@njit
+def noise_factor(state, source):
+    """Return the factor on the covariances of a receiver's fixes that their scatter asks for (see ``recovery``)."""
+    return state.scatter[source] if state.scatter[source] > NOTABLE_SCATTER else 1.0
 
 
 @njit
@@ -60,6 +69,10 @@ def linearize(state, payload, source, settings, work):
         work.innovation[i] = measured[i] - predicted[i]
     set_identity(work.jacobian, POSITION)
     set_east_north_up_covariance(work.noise, state, east_north_up_to_ecef(payload[0], payload[1]), payload, 3)
+    factor = noise_factor(state, source)
+    for i in range(SIZE):
+        for j in range(SIZE):
+            work.noise[i, j] *= factor
     add_lasting_error(state, settings, work)
     lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[source])
     if state.heading_known == 0:
