@@ -835,7 +835,8 @@ class Alignment:
         math.nan,
         "deg",
         "Heading at start when it is known: yaw of base_link, 0 = east, counter-clockwise. "
-        ".nan = unknown, it is then found from the course over ground.",
+        ".nan = unknown: then a dual antenna, the magnetometer or imu_orientation tell it, in this order, or it is "
+        "found from the accelerations and the course over ground.",
         minimum=-360.0,
         maximum=360.0,
         nan_allowed=True,

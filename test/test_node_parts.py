@@ -773,7 +773,7 @@ def test_a_signal_while_the_node_is_made_ends_at_once(ros: Ros, tmp_path: Path) 
     script.write_text(NODE.replace('super().__init__("echo")', slow))
     process = ros.spawn([script])
     ros.until(lambda: "1" in process.output, what="the node to be under way")
-    assert process.stop(signal.SIGTERM, timeout=5.0) == 0
+    assert process.stop(signal.SIGTERM, timeout=30.0) == 0
     assert process.output == "1\n"
 
 

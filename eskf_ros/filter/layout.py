@@ -230,6 +230,16 @@ STATE = np.dtype(
         ("still_stamp", "i8"),
         ("still_count", "i8"),
         ("still_sum", "f8", (6,)),
+        # The window in parts (see ``sway``): the one being filled, sums of the means of the others; the largest
+        # variances of these means in the run.
+        ("part_start", "i8"),
+        ("part_count", "i8"),
+        ("part_sum", "f8", (6,)),
+        ("parts", "i8"),
+        ("part_mean_sum", "f8", (6,)),
+        ("part_square_sum", "f8", (6,)),
+        ("sway_force", "f8"),
+        ("sway_rate", "f8"),
         # IMU samples since the last point on the grid of the constraints: the point after them, whether one is missing,
         # how many, sums.
         ("block_end", "i8"),
@@ -248,6 +258,9 @@ STATE = np.dtype(
         ("tilted_windows", "i8"),
         ("tilted_force", "f8", (3,)),
         ("fast_windows", "i8"),
+        # Still windows in a row with the same mean rate (rad/s), which is too large for a bias.
+        ("biased_windows", "i8"),
+        ("biased_rate", "f8", (3,)),
         # Monitors of the heading: sums of cosine and sine, and how many. Messages of the dual antenna and of the
         # magnetometer against the estimate; course over ground against the estimate.
         ("heading_contrast", "f8", (2, 3)),

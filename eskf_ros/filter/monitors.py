@@ -9,6 +9,7 @@ import numpy as np
 from eskf_ros.compiled import njit
 from eskf_ros.earth import STANDARD_GRAVITY
 from eskf_ros.filter.layout import Stream
+from eskf_ros.filter.sway import can_be_bias
 from eskf_ros.rotation import dot, rotate, wrapped
 
 MAG = int(Stream.MAG)
@@ -21,6 +22,10 @@ UPRIGHT_COSINE = 0.7
 FASTEST_TURN = 15.0
 """At rest gravity is within this part of its value and within 45 degrees of the z axis of base_link; nothing that
 navigates turns this fast (rad/s) for seconds."""
+
+SAME_RATE = 0.1
+BIASED_WINDOWS = 3
+"""A rate that changes by less than this part from window to window, through so many, is a bias: nothing turns so."""
 
 MEMORY = 0.99
 LASTING_COUNT = 40.0
@@ -45,6 +50,7 @@ def watch_input(state, still, settings):
         state.odd_gravity_windows += 1
         state.odd_gravity = strength
     elif still:
+        watch_bias(state, rate, settings)
         state.rest_windows += 1
         force_base = rotate(settings.imu_to_base, force)
         if force_base[2] < UPRIGHT_COSINE * strength:
@@ -53,6 +59,22 @@ def watch_input(state, still, settings):
                 state.tilted_force[i] = force_base[i]
     if math.sqrt(dot(rate, rate)) > FASTEST_TURN:
         state.fast_windows += 1
+
+
+@njit
+def watch_bias(state, rate, settings):
+    """Count still windows in a row with one mean rate (rad/s) that is too large for what is expected of the bias."""
+    nothing = (0.0, 0.0, 0.0)
+    if can_be_bias(rate, nothing, settings.gyro_bias_std, 0.0):
+        state.biased_windows = 0
+        return
+    last = state.biased_rate
+    change = (rate[0] - last[0], rate[1] - last[1], rate[2] - last[2])
+    if dot(change, change) > SAME_RATE**2 * dot(rate, rate):
+        state.biased_windows = 0
+    state.biased_windows += 1
+    for i in range(3):
+        state.biased_rate[i] = rate[i]
 
 
 @njit
@@ -141,6 +163,12 @@ def complaints(state: np.void) -> list[str]:
         elif abs(strength - 1.0) < GRAVITY_TOLERANCE:
             cause = "it is in units of g; REP-103 wants m/s2"
         found.append(f"the accelerometer reads {strength:.2f} m/s2 where gravity is {STANDARD_GRAVITY:.2f}: {cause}")
+    if state["biased_windows"] >= BIASED_WINDOWS:
+        x, y, z = np.degrees(state["biased_rate"])
+        found.append(
+            f"at rest the gyro reads ({x:.2f}, {y:.2f}, {z:.2f}) deg/s, more than imu.gyro_bias_std allows for: raise "
+            "it, or calibrate the gyro"
+        )
     if state["tilted_windows"] > max(1, int(state["rest_windows"]) // 4):
         x, y, z = (float(value) for value in state["tilted_force"])
         found.append(

@@ -14,6 +14,7 @@ from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
 from eskf_ros.filter.aiding import baro, gnss_position, gnss_velocity, heading, mag, nhc, wheel
 from eskf_ros.filter.alignment import (
     heading_of,
+    level_again,
     move_datum,
     note_position,
     note_velocity,
@@ -54,6 +55,7 @@ from eskf_ros.filter.recovery import gate_of, phase_of, recover, watch_solution
 from eskf_ros.filter.settings import intakes_from, settings_from
 from eskf_ros.filter.stillness import add_to_block, watch_wheels
 from eskf_ros.filter.strapdown import SECOND, propagate
+from eskf_ros.filter.sway import add_to_part
 from eskf_ros.filter.timeline import (
     CHECKPOINT_SPACING,
     doubled,
@@ -134,7 +136,9 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
         predict(state, sample.stamp, sample, settings, work)
         take_sample(state, sample)
         measure_step(state, settings)
+        add_to_part(state)
         watch_stillness(state, settings)
+        level_again(state, settings)
         add_to_block(state, settings)
         save_checkpoint(states, checkpoints, t)
 
