@@ -72,7 +72,6 @@ NO_WHEEL = "wheel.use: false"
 NHC = ("nhc.enabled: true", *tsukishima.REAR_AXLE)
 CORRELATED = "gnss.correlation_time: 30.0"
 TIGHT = ("mode: tight", f"ranges.time_offset: {tsukishima.TIME_OFFSET}")
-STREET_MASKS = ("ranges.cn0_mask: 38.0", "ranges.elevation_mask_deg: 25.0")
 
 INPUTS = (Variant("position only", (POSITION,)), Variant("with velocity"))
 TSUKISHIMA = (
@@ -90,8 +89,7 @@ TSUKISHIMA_RANGES = (
     Variant("loose, with velocity", (NO_WHEEL,)),
     Variant("loose, with velocity, correlated errors", (NO_WHEEL, CORRELATED)),
     Variant("tight", (*TIGHT, NO_WHEEL)),
-    Variant("tight, masks for streets", (*TIGHT, *STREET_MASKS, NO_WHEEL)),
-    Variant("tight, masks for streets, wheel, NHC", (*TIGHT, *STREET_MASKS, *NHC)),
+    Variant("tight, wheel, NHC", (*TIGHT, *NHC)),
 )
 RANGES = (
     Variant("loose, position only", (POSITION,)),
