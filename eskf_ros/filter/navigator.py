@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
+from eskf_ros.filter.aid_monitors import aid_complaints, watch_aid
 from eskf_ros.filter.aiding import baro, gnss_position, gnss_velocity, heading, nhc, wheel
 from eskf_ros.filter.alignment import (
     heading_of,
@@ -201,11 +202,10 @@ def fuse(state, aids, i, settings, work):
     if not is_aligned_for(state, aid.stream):
         aid.verdict = BEFORE_ALIGNMENT if aid.stream < FIRST_CONSTRAINT else INACTIVE
         return
+    if state.position_known == 0 and aid.stream == GNSS_POSITION:
+        begin(state, aid, settings)
     position = (state.position_map[0], state.position_map[1], state.position_map[2])
     heading_before = heading_of(state, settings)
-    if state.position_known == 0 and aid.stream == GNSS_POSITION:
-        start_position(state, aid.payload)
-        recall_heading(state, aid.payload, settings)
     join(state, settings.reach[aid.stream], settings)
     watch_solution(state, aid, settings)
     size = linearize(state, aid, settings, work)
@@ -226,10 +226,21 @@ def fuse(state, aids, i, settings, work):
     gate = gate_of(state, aid, size, settings)
     aid.verdict, aid.nis = update(state, size, gate, work)
     recover(state, aid, size, gate, settings, work)
+    watch_aid(state, aid, size, gate, work, settings)
     if aid.verdict == FUSED and state.heading_known == 0:
         search_heading(state, aid, gate, settings, work)
     if aid.stream == WHEEL:
         watch_wheels(state, aid)
+    note_jump(state, position, heading_before, settings)
+
+
+@njit
+def begin(state, aid, settings):
+    """Take the position from the first fix, and the heading from memory if the robot is where it was left."""
+    position = (state.position_map[0], state.position_map[1], state.position_map[2])
+    heading_before = heading_of(state, settings)
+    start_position(state, aid.payload)
+    recall_heading(state, aid.payload, settings)
     note_jump(state, position, heading_before, settings)
 
 
@@ -621,7 +632,7 @@ class Navigator:
     @property
     def complaints(self) -> list[str]:
         """What is wrong with whole streams, one sentence each with what to do; empty when nothing is."""
-        found = complaints(self._states[0])
+        found = complaints(self._states[0]) + aid_complaints(self._states[0], self._settings[0])
         if self._stand_ins:
             found.append(
                 f"{self._stand_ins} messages came without a covariance (unknown type or all zero): "
