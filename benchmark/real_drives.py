@@ -164,12 +164,12 @@ def table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
-def between_markers(text: str, content: str) -> str:
+def between_markers(text: str, content: str, markers: tuple[str, str] = MARKERS) -> str:
     """`text` with `content` between the markers; raises ValueError when they are not there."""
-    before, begin, rest = text.partition(MARKERS[0])
-    _, end, after = rest.partition(MARKERS[1])
+    before, begin, rest = text.partition(markers[0])
+    _, end, after = rest.partition(markers[1])
     if not (begin and end):
-        raise ValueError(f"{RESULTS}: the lines {MARKERS[0].strip()!r} and {MARKERS[1].strip()!r} are missing")
+        raise ValueError(f"{RESULTS}: the lines {markers[0].strip()!r} and {markers[1].strip()!r} are missing")
     return before + begin + content + end + after
 
 

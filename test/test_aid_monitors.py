@@ -129,7 +129,8 @@ def test_covariances_that_are_too_small_are_named(changes: dict[str, Any]) -> No
 
 
 def test_velocities_that_claim_too_much_are_named() -> None:
-    sentence = only_complaint("drive", 10, {"gnss.covariance_scale": 0.1, "gnss.position_std_floor": 1.0})
+    changes = {"gnss.covariance_scale": 0.1, "gnss.position_std_floor": 1.0}
+    sentence = navigated("drive", 10, changes).complaints[0]
     assert "velocities" in sentence
     assert 1.5 < numbers(sentence)[0] < 3.5
 

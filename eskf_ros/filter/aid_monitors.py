@@ -289,7 +289,7 @@ def aid_complaints(state: np.void, settings: np.void) -> list[str]:
         found += faults + lies
         if not faults and not lies:
             found += _path_complaints(state, source)
-            found += _velocity_complaints(state, source) or _departure_complaints(state, source)
+            found += _velocity_complaints(state, source) + _departure_complaints(state, source)
     if state["resets"]:
         cause = "" if found else ": IMU noise parameters too small, or multipath for many seconds"
         found.append(
