@@ -42,11 +42,14 @@ setup(
             "ros-jazzy-common-interfaces; sys_platform == 'linux' and platform_machine == 'x86_64'",
             "ros-rclpy[fastrtps]==7.1.6; sys_platform == 'linux' and platform_machine == 'x86_64'",
         ],
+        # The World Magnetic Model, for the declination that a magnetometer needs; MIT, 0.3 MB, without dependencies.
+        "mag": ["pygeomag"],
         "test": [
             "matplotlib",
             "gtsam",
             "hypothesis",
             "mypy",
+            "pygeomag",
             "pymap3d",
             # Independent GNSS libraries, wheels for Linux on x86-64; without them these comparisons are skipped.
             "pyrtklib5; sys_platform == 'linux' and platform_machine == 'x86_64' and python_version < '3.13'",

@@ -55,7 +55,7 @@ def measure(rate: float, seconds: float, is_late: bool) -> dict[str, float]:
             **os.environ,
             "ROS_DOMAIN_ID": str(free_domain()),
             "ROS_LOG_DIR": folder,
-            "PYTHONPATH": str(ROOT),
+            "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]),
         }
 
         def start(*words: object) -> Process:

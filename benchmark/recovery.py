@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from monte_carlo import NO_SIDE_SLIP, Array, Run, feed, nees, run, state_error
-from real_drives import between_markers, table
+from real_drives import table
 
 from eskf_ros.filter.layout import POSITION
 from eskf_ros.filter.navigator import Navigator
@@ -178,8 +178,17 @@ def main() -> int:
     content += "\n### A receiver that lies consistently\n\n"
     content += table(["IMU", *(f"{acceleration:g} m/s2" for acceleration in ACCELERATIONS)], rows) + "\n"
     print(content)
-    RESULTS.write_text(between_markers(RESULTS.read_text(encoding="utf-8"), content, MARKERS), encoding="utf-8")
+    RESULTS.write_text(between_markers(RESULTS.read_text(encoding="utf-8"), content), encoding="utf-8")
     return 1 if faults else 0
+
+
+def between_markers(text: str, content: str) -> str:
+    """`text` with `content` between the markers; raises ValueError when they are not there."""
+    before, begin, rest = text.partition(MARKERS[0])
+    _, end, after = rest.partition(MARKERS[1])
+    if not (begin and end):
+        raise ValueError(f"{RESULTS}: the lines {MARKERS[0].strip()!r} and {MARKERS[1].strip()!r} are missing")
+    return before + begin + content + end + after
 
 
 def three(values: Array) -> str:

@@ -9,11 +9,13 @@ files. The cache folder therefore carries a digest of all files with kernels: a 
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import itertools
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -62,6 +64,30 @@ def _prune(parent: Path) -> None:
     folders = sorted((f for f in parent.iterdir() if f.is_dir()), key=lambda f: f.stat().st_mtime, reverse=True)
     for folder in folders[_KEPT_CACHES:]:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def while_compiling(tell: Callable[[int], None]) -> Iterator[None]:
+    """While this lasts, call ``tell`` after each function that was compiled, with their number so far.
+
+    What comes from the cache does not count.
+    """
+    if not COMPILED:
+        yield
+        return
+    from numba.core import event
+
+    counts = itertools.count(1)
+
+    class Listener(event.Listener):  # type: ignore[misc]
+        def on_start(self, started: Any) -> None:
+            pass
+
+        def on_end(self, ended: Any) -> None:
+            tell(next(counts))
+
+    with event.install_listener("numba:compile", Listener()):
+        yield
 
 
 if COMPILED:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from eskf_ros.bags import POINT_CLOUD, Batch
 from eskf_ros.filter.layout import Stream
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.parameters import Parameters
 from eskf_ros.ranges.intake import RangeIntake
 
 Arguments = Iterable[tuple[Any, ...]]
@@ -40,7 +41,8 @@ class Input:
     `Navigator`, or of `RangeIntake`, that takes the arguments; empty: `Navigator.push`, with the stream. ``is_gnss``:
     withheld in an outage.
     ``by_receiver``: two receivers may share the topic, told apart by the frame. ``depth``: messages that may wait in
-    the node while the computer is busy elsewhere, a second of a fast sensor.
+    the node while the computer is busy elsewhere, a second of a fast sensor. ``is_timed``: its stamps are instants of
+    measurements.
     """
 
     name: str
@@ -52,6 +54,7 @@ class Input:
     is_gnss: bool = False
     by_receiver: bool = False
     depth: int = 1000
+    is_timed: bool = True
 
     @property
     def types(self) -> tuple[str, ...]:
@@ -201,7 +204,7 @@ INPUTS = (
         _body_velocities,
         ((BARE_TWIST, _body_velocities), (ODOMETRY, _body_velocities)),
     ),
-    Input("ephemerides", Stream.PSEUDORANGE, POINT_CLOUD, _clouds, push="take_ephemerides", depth=50),
+    Input("ephemerides", Stream.PSEUDORANGE, POINT_CLOUD, _clouds, push="take_ephemerides", depth=50, is_timed=False),
     Input("ranges", Stream.PSEUDORANGE, POINT_CLOUD, _clouds, push="take_ranges", is_gnss=True, depth=50),
     Input("baro", Stream.BARO, "sensor_msgs/msg/FluidPressure", _pressures),
 )
@@ -209,3 +212,21 @@ INPUTS = (
 
 FIXES = ("gnss_fix", "gnss_velocity")
 RANGES = ("ranges", "ephemerides")
+
+
+def inputs_of(parameters: Parameters) -> tuple[Input, ...]:
+    """The rows in use: either what a receiver solved or its ranges, never both."""
+    unused = FIXES if uses_ranges(parameters) else RANGES
+    return tuple(kind for kind in INPUTS if kind.name not in unused)
+
+
+def uses_ranges(parameters: Parameters) -> bool:
+    """Whether GNSS is used by its ranges."""
+    return parameters.mode == "tight" or parameters.ranges.use_point_solution
+
+
+def time_offset_of(kind: Input, parameters: Parameters) -> float:
+    """What is added to the stamps of an input (s)."""
+    group = "gnss" if kind.name in FIXES else "ranges" if kind.name in RANGES else kind.name
+    offset: float = getattr(parameters, group).time_offset
+    return offset

@@ -118,7 +118,7 @@ class Topics:
         "whose variance is above 1 rad2 is not used.",
         **_TOPIC,
     )
-    mag: str = _parameter("imu/mag", "", "sensor_msgs/MagneticField: magnetometer in the frame of the IMU.", **_TOPIC)
+    mag: str = _parameter("imu/mag", "", "sensor_msgs/MagneticField: field in the axes of the magnetometer.", **_TOPIC)
     wheel: str = _parameter(
         "wheel/odom", "", "nav_msgs/Odometry: wheel odometry, of which speed and yaw rate are used.", **_TOPIC
     )
@@ -432,6 +432,56 @@ class Mag(Aid):
         "misleads.",
         live=True,
     )
+    mount_rpy_deg: tuple[float, ...] = _parameter(
+        (),
+        "deg",
+        "Orientation of the magnetometer in base_link: roll, pitch, yaw about fixed axes as in a URDF. "
+        "Empty: its axes are those of the IMU.",
+        lengths=(0, 3),
+        minimum=-360.0,
+        maximum=360.0,
+    )
+    declination_deg: float = _parameter(
+        math.nan,
+        "deg",
+        "Angle from true north to magnetic north, east positive. .nan: from the World Magnetic Model for the place of "
+        "the fixes and the date of their stamps, for which the Python package pygeomag must be installed.",
+        minimum=-180.0,
+        maximum=180.0,
+        nan_allowed=True,
+    )
+    error_std_deg: float = _parameter(
+        4.0,
+        "deg",
+        "Standard deviation of the heading error that remains after calibration, by iron in the vehicle and nearby. It "
+        "does not average out while the vehicle stands.",
+        above=0.0,
+        maximum=180.0,
+    )
+    error_distance: float = _parameter(
+        50.0,
+        "m",
+        "Having travelled so far, or turned by one radian, the vehicle meets another such error.",
+        above=0.0,
+        maximum=1.0e6,
+    )
+    strength_tolerance: float = _parameter(
+        0.15,
+        "",
+        "A field is taken for disturbed where its strength differs by more than this part from that of the World "
+        "Magnetic Model. Without the model nothing is checked.",
+        above=0.0,
+        maximum=10.0,
+        live=True,
+    )
+    inclination_tolerance_deg: float = _parameter(
+        8.0,
+        "deg",
+        "The same for its inclination (dip).",
+        above=0.0,
+        maximum=180.0,
+        live=True,
+    )
     std_floor: float = _parameter(
         1.0e-6,
         "T",
@@ -620,6 +670,22 @@ class Ranges(Aid):
         maximum=1.0e3,
         live=True,
     )
+    correlation_time: float = _parameter(
+        60.0,
+        "s",
+        "How long the common error of the pseudoranges lasts (e-folding time): reflections, orbits, what the models "
+        "leave of the atmosphere. 0: not modelled, and the estimate then trusts the mean of many epochs too much.",
+        minimum=0.0,
+        maximum=1.0e5,
+    )
+    correlated_std: float = _parameter(
+        1.5,
+        "m",
+        "With a correlation_time: the standard deviation of a position, per axis, by errors that last.",
+        above=0.0,
+        maximum=1000.0,
+        live=True,
+    )
     inter_system_std: float = _parameter(
         10.0,
         "m",
@@ -734,6 +800,14 @@ class Estimate:
     mounting_std_deg: float = _parameter(
         2.0, "deg", "Standard deviation of these angles at start.", above=0.0, maximum=45.0
     )
+    magnetic_bias: bool = _parameter(
+        False,
+        "",
+        "Estimate the hard iron that turns with the magnetometer. It shows as the vehicle turns.",
+    )
+    magnetic_bias_std: float = _parameter(
+        3.0e-6, "T", "Standard deviation per axis of this field at start.", above=0.0, maximum=1.0e-3
+    )
     mounting_random_walk: float = _parameter(
         3.0e-5,
         "rad/rtHz",
@@ -761,7 +835,8 @@ class Alignment:
         math.nan,
         "deg",
         "Heading at start when it is known: yaw of base_link, 0 = east, counter-clockwise. "
-        ".nan = unknown, it is then found from the course over ground.",
+        ".nan = unknown: then a dual antenna, the magnetometer or imu_orientation tell it, in this order, or it is "
+        "found from the accelerations and the course over ground.",
         minimum=-360.0,
         maximum=360.0,
         nan_allowed=True,
@@ -805,6 +880,21 @@ class Alignment:
         "direction the vehicle moves. It counts as known when its standard deviation falls below this.",
         above=0.0,
         maximum=30.0,
+    )
+    imu_orientation: str = _choice(
+        "unused",
+        "What Imu.orientation is good for at start, where nothing better tells the heading: true_north, its yaw is 0 "
+        "in the east (REP-103); magnetic_north, its yaw counts from magnetic east (REP-145), and the declination is "
+        "added as for mag.",
+        "true_north",
+        "magnetic_north",
+    )
+    imu_orientation_std_deg: float = _parameter(
+        10.0,
+        "deg",
+        "Standard deviation of this heading at least.",
+        above=0.0,
+        maximum=90.0,
     )
     use_course: bool = _parameter(
         True,

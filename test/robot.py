@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -79,10 +80,17 @@ class Robot:
 
         self.ros.until(is_ready, 90.0, "the node to subscribe and to report")
 
-    def play(self, drive: list[tuple[int, str, bytes]], speed: float = SPEED) -> None:
-        """Publish in recorded order and time; the last IMU sample waits until all others have arrived."""
+    def play(
+        self,
+        drive: list[tuple[int, str, bytes]],
+        speed: float = SPEED,
+        until: Callable[[], object] = lambda: False,
+    ) -> None:
+        """Publish in recorded order and time, to the end or until a condition holds."""
         start, begin = drive[0][0], time.monotonic()
         for log_time, topic, data in drive:
+            if until():
+                return
             while time.monotonic() - begin < (log_time - start) * 1e-9 / speed:
                 self.ros.spin_once(0.0005)
             self.publishers[topic].publish(data)

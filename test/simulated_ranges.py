@@ -28,7 +28,8 @@ Array = NDArray[np.float64]
 
 ALL = (Gnss.GPS, Gnss.GALILEO, Gnss.BEIDOU, Gnss.GLONASS)
 LOWEST_DEG = 10.5
-PARAMETERS: dict[str, Any] = {"mode": "tight"}
+PARAMETERS: dict[str, Any] = {"mode": "tight", "ranges.correlation_time": 0.0}
+"""The errors of these ranges are new every time."""
 
 
 @njit

@@ -11,15 +11,29 @@ from kernels import copy_of
 
 from eskf_ros.filter.layout import Stream, Verdict
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.magnetic_model import FieldUnknown, field_at
 from eskf_ros.parameters import from_mapping
 from eskf_ros.simulate.barometer import Barometer
 from eskf_ros.simulate.dual_antenna import DualAntenna
-from eskf_ros.simulate.scenario import simulate
+from eskf_ros.simulate.episodes import MagneticDisturbance
+from eskf_ros.simulate.magnetometer import Magnetometer
+from eskf_ros.simulate.scenario import START_STAMP, simulate
 
 SECOND = 1_000_000_000
 
 CASES: dict[str, tuple[Stream, dict[str, Any], dict[str, Any]]] = {
     "heading": (Stream.HEADING, {"dual_antenna": DualAntenna(pitch_std_deg=0.5)}, {}),
+    "mag": (
+        Stream.MAG,
+        {"magnetometer": Magnetometer(hard_iron_std=1e-6, rate=10.0)},
+        {"mag.use": True, "mag.declination_deg": 4.3, "estimate.magnetic_bias": True},
+    ),
+    # With the model of the field, where it is installed: strength and inclination at each fix.
+    "mag by the model": (
+        Stream.MAG,
+        {"magnetometer": Magnetometer(rate=10.0), "episodes": (MagneticDisturbance(12.0, 3.0),)},
+        {"mag.use": True},
+    ),
     "baro": (Stream.BARO, {"barometer": Barometer(rate=5.0)}, {}),
 }
 
@@ -27,6 +41,11 @@ CASES: dict[str, tuple[Stream, dict[str, Any], dict[str, Any]]] = {
 @pytest.mark.parametrize("case", CASES)
 def test_arrival_order_changes_no_bit(case: str) -> None:
     stream, sensors, parameters = CASES[case]
+    if "model" in case:
+        try:
+            field_at(48.0, 11.0, 500.0, START_STAMP)
+        except FieldUnknown as problem:
+            pytest.skip(str(problem))
     recording = simulate("drive", 6, imu_rate=25.0, stop=26.0, **sensors)
     settings = from_mapping({**recording.parameters(), "datum": [], **parameters})
     measured = offers(recording)

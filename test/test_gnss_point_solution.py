@@ -14,28 +14,23 @@ from gnss_sky import KLOBUCHAR, SECONDS, WEEK, Receiver, all_constellations, mea
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from recordings.tsukishima import ranges_of
 
 from eskf_ros.earth import east_north_up_to_ecef, geodetic_to_ecef
 from eskf_ros.gnss.ephemeris import Ephemerides
 from eskf_ros.gnss.point_solution import DEFAULT_SETTINGS, PointSettings, PointSolution, SolutionStatus, solve
 from eskf_ros.gnss.range_model import NO_KLOBUCHAR, PREDICTION, predict
 from eskf_ros.gnss.ranges import (
-    ALREADY_TURNED,
-    CLOCK_APPLIED,
-    CODE_VALID,
-    DOPPLER_VALID,
     RANGE,
-    SATELLITE_KNOWN,
     TROPOSPHERE_APPLIED,
     Status,
-    allocate_ranges,
     ionosphere_free,
     locate,
     one_per_satellite,
 )
 from eskf_ros.gnss.rinex_nav import read_navigation
 from eskf_ros.gnss.rinex_obs import read_observations
-from eskf_ros.gnss.signals import BEIDOU_3, L1, SIGNAL_BY_CODE, SPEED_OF_LIGHT, Gnss
+from eskf_ros.gnss.signals import BEIDOU_3, L1, SPEED_OF_LIGHT, Gnss
 from eskf_ros.gnss.weighting import DEFAULT_WEIGHTING
 
 Array = NDArray[np.float64]
@@ -382,7 +377,7 @@ def test_streets(data_folder: Callable[[str], Path]) -> None:
     for begin, end in zip(starts[:-1:7], starts[1::7]):
         if epochs[begin] not in fixed:
             continue
-        ranges = tokyo_ranges(rows[begin:end])
+        ranges = ranges_of(rows[begin:end])
         for settings, errors in horizontal.items():
             solution = solve(ranges, 2130, epochs[begin] / 5.0, None, settings)
             assert solution.status == SolutionStatus.SOLVED
@@ -391,23 +386,6 @@ def test_streets(data_folder: Callable[[str], Path]) -> None:
     assert len(horizontal[robust]) > 400
     assert np.percentile(horizontal[robust], 50) < 3.2
     assert np.percentile(horizontal[robust], 95) < 0.75 * np.percentile(horizontal[plain], 95)
-
-
-def tokyo_ranges(rows: Array) -> NDArray[np.void]:
-    """Ranges whose satellites, troposphere and satellite clocks the authors of the recording have put in."""
-    ranges = allocate_ranges(len(rows))
-    # Numbers of QZSS repeat those of GPS; they are farther away.
-    ranges["gnss_id"] = np.where(rows[:, 4] > 30e6, Gnss.QZSS, Gnss.GPS)
-    ranges["sv_id"], ranges["signal"], ranges["carrier_hz"] = rows[:, 3], SIGNAL_BY_CODE[Gnss.GPS, "1C"], L1
-    ranges["pseudorange"], ranges["cn0"] = rows[:, 4], rows[:, 14]
-    ranges["satellite"], ranges["satellite_velocity"] = rows[:, 5:8], rows[:, 10:13]
-    ranges["satellite_clock"], ranges["satellite_clock_drift"] = 0.0, rows[:, 9]
-    ranges["doppler"] = -rows[:, 8] * L1 / SPEED_OF_LIGHT
-    ranges["flags"] = CODE_VALID | DOPPLER_VALID | SATELLITE_KNOWN | CLOCK_APPLIED
-    ranges["flags"] |= TROPOSPHERE_APPLIED | ALREADY_TURNED
-    locate(ranges, 2130, 0.0, Ephemerides())
-    assert (ranges["status"] == Status.USABLE).all()
-    return ranges
 
 
 def test_prediction_follows_the_flags() -> None:

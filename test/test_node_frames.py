@@ -14,7 +14,7 @@ from ros_process import needs_ros
 from scipy.spatial.transform import Rotation
 
 from eskf_ros.filter.layout import ODOMETRY
-from eskf_ros.node.extrinsics import ANTENNA, IMU, Extrinsics
+from eskf_ros.node.extrinsics import ANTENNA, IMU, Extrinsics, matrix_of, roll_pitch_yaw_deg
 from eskf_ros.node.planar import PLANAR, flatten
 from eskf_ros.node.transforms import Track, TransformWatch, map_to_odom, yaw_of
 from eskf_ros.parameters import Parameters, from_mapping
@@ -120,6 +120,15 @@ def test_a_sensor_is_found_along_the_tree(links):
     assert np.allclose(imu.mount_position, in_base, atol=1e-7)
     mounted = Rotation.from_euler("xyz", imu.mount_rpy_deg, degrees=True)
     assert (mounted * (a.inv() * b * c).inv()).magnitude() < 1e-6
+
+
+@given(angles, st.sampled_from([None, 90.0, -90.0]))
+def test_roll_pitch_yaw_of_a_matrix(turns, pitch):
+    """Straight up and down too, where there are many answers: any of them is right."""
+    rotation = Rotation.from_euler("ZYX", (turns[0], turns[1] if pitch is None else math.radians(pitch), turns[2]))
+    found = Rotation.from_euler("xyz", roll_pitch_yaw_deg(rotation.as_matrix()), degrees=True)
+    assert (found * rotation.inv()).magnitude() < 1e-7
+    assert np.allclose(matrix_of(*rotation.as_quat()), rotation.as_matrix(), atol=1e-12)
 
 
 @needs_ros

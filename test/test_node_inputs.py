@@ -12,13 +12,17 @@ from eskf_ros.bags import Batch, StringTable, decode, encode, message_dtype
 from eskf_ros.filter.layout import Stream, Verdict
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.settings import intakes_from
-from eskf_ros.inputs import INPUTS
+from eskf_ros.gnss.cloud import fields_of, write_epoch
+from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, SATELLITE_KNOWN, allocate_ranges
+from eskf_ros.gnss.ranges import Status as RangeStatus
+from eskf_ros.inputs import INPUTS, RANGES
 from eskf_ros.parameters import Leaf, ParameterError, Parameters, from_mapping, leaves
+from eskf_ros.ranges.intake import RangeIntake
 
 SECOND = 1_000_000_000
 STAMP = 1_700_000_000_123_456_789
 LEAVES: dict[str, Leaf] = {leaf.name: leaf for leaf in leaves()}
-EVERY_TYPE = [(kind, name) for kind in INPUTS for name in kind.types]
+EVERY_TYPE = [(kind, name) for kind in INPUTS if kind.name not in RANGES for name in kind.types]
 names = [f"{kind.name}-{name.rpartition('/')[2]}" for kind, name in EVERY_TYPE]
 
 
@@ -42,8 +46,9 @@ def test_every_input_has_its_parameters() -> None:
         assert f"topics.{kind.name}" in LEAVES
         choice = LEAVES.get(f"topics.{kind.name}_type")
         assert (choice.rule.pattern.split("|") if choice else [kind.type]) == list(kind.types)
-        assert kind.stream in intakes_from(Parameters())
-    assert len({kind.name for kind in INPUTS}) == len({kind.stream for kind in INPUTS}) == len(INPUTS)
+        assert kind.name in RANGES or kind.stream in intakes_from(Parameters())
+    # Ephemerides are no measurements: they have no stream of their own.
+    assert len({kind.name for kind in INPUTS}) == len({kind.stream for kind in INPUTS}) + 1 == len(INPUTS)
     assert {name for name in LEAVES if name.startswith("topics.") and name.endswith("_type")} == {
         f"topics.{kind.name}_type" for kind in INPUTS if kind.others
     }
@@ -98,6 +103,39 @@ def test_what_is_no_message_is_refused_and_other_encodings_are_read(kind: Any, t
     padded = good[:2] + b"\x00\x03" + good[4:]  # the padding at the end, counted in the options
     (found,) = source.arguments(source.read(padded, 5))
     assert all(map(same, found, expected))
+
+
+@needs_ros
+def test_clouds_reach_the_navigator_as_in_the_replay() -> None:
+    """A cloud of ranges, serialised by the message library, read by the node and as in a recording."""
+    from rclpy.serialization import serialize_message
+    from sensor_msgs.msg import PointCloud2, PointField
+
+    from eskf_ros.node.inputs import open_inputs
+
+    ranges = allocate_ranges(4)
+    ranges["sv_id"], ranges["signal"] = np.arange(1, 5), 0
+    ranges["satellite"] = 2.6e7 * np.eye(4, 3) + (1e5, 2e5, 3e5)
+    ranges["satellite"][3] = 1.5e7
+    ranges["satellite_velocity"], ranges["satellite_clock_drift"] = 1000.0, 0.0
+    ranges["pseudorange"], ranges["doppler"], ranges["satellite_clock"] = 2.3e7, 100.0, 1e-4
+    ranges["flags"] = CODE_VALID | DOPPLER_VALID | SATELLITE_KNOWN
+    points = write_epoch(ranges, 2300, 1000.0, satellites=True)
+    message = PointCloud2(height=1, width=4, point_step=points.itemsize, row_step=4 * points.itemsize, is_dense=True)
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(STAMP, SECOND)
+    message.fields = [
+        PointField(name=f.name, offset=f.offset, datatype=f.datatype, count=f.length) for f in fields_of(points.dtype)
+    ]
+    message.data = points.tobytes()
+    data = serialize_message(message)
+    (source,) = (source for source in open_inputs(from_mapping({"mode": "tight"}), str) if source.kind.name == "ranges")
+    ((stamp, found, arrival),) = source.arguments(source.read(data, 5))
+    (expected,) = arguments_in_a_recording(source.kind, source.kind.type, data, 5)
+    assert (stamp, arrival) == (STAMP, 5) == (expected[0], expected[2])
+    assert found.tobytes() == expected[1].tobytes() == points.tobytes()
+    navigator = Navigator(from_mapping({"mode": "tight"}))
+    source.kind.push_of(navigator, RangeIntake(navigator, navigator.parameters))(stamp, found, arrival)
+    assert navigator.range_statuses[RangeStatus.USABLE] == 4
 
 
 def test_a_velocity_without_covariance_takes_the_stand_in() -> None:

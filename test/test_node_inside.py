@@ -167,6 +167,32 @@ def test_the_second_antenna_is_found_on_tf_static(make):
 
 
 @needs_ros
+def test_a_place_found_in_time_restarts_nothing_and_one_found_late_does(make, start):
+    """A barometer whose first message comes late is placed at once; an antenna that was taken for base_link is not."""
+    from test_node_frames import Rotation, transform
+    from test_node_inputs import serialised
+
+    pressure = serialised("sensor_msgs/msg/FluidPressure", "baro", stamp=start[-1][0])
+    inside = make("-p", "gnss.lever_arm:=[0.0, 0.0, 0.0]")
+    inside.node._on_static_transforms(
+        SimpleNamespace(transforms=[transform("base_link", "baro", (0.0, 0.5, 0.2), Rotation.identity())])
+    )
+    inside.play(start)
+    inside.give("baro", pressure)
+    assert inside.node.parameters.baro.position == (0.0, 0.5, 0.2)
+    inside.report()
+    assert inside.values["resets"] == "0"
+    assert inside.values["place of the barometer"] == "/tf_static"
+    assert inside.values["place of the GNSS antenna"] == "taken to be base_link"
+    inside.node._on_static_transforms(
+        SimpleNamespace(transforms=[transform("base_link", "gps", (1.0, 0.0, 2.0), Rotation.identity())])
+    )
+    assert inside.node.parameters.gnss.lever_arm == (1.0, 0.0, 2.0)
+    inside.report()
+    assert inside.values["resets"] == "1"
+
+
+@needs_ros
 def test_velocities_of_another_type(make, drive):
     """TwistStamped in place of TwistWithCovarianceStamped: fused, with the stand-in for the covariance."""
     from rclpy.serialization import deserialize_message, serialize_message
@@ -343,6 +369,74 @@ def test_a_clock_that_is_set_is_told_and_survived(make, drive, start, monkeypatc
     assert any("the alignment began again" in line for line in lines)
     assert inside.values["resets"] == "0"
     assert inside.node.navigator.status == Status.GOOD
+
+
+@needs_ros
+def test_a_message_that_comes_too_late_is_named_with_the_window(make, drive):
+    inside = make("-p", "history.window:=0.5")
+    late = next(k for k, message in enumerate(drive) if message[1] == "gps/fix" and message[0] > drive[0][0] + SECOND)
+    inside.play([*drive[:late], *drive[late + 1 : late + 300], drive[late]])
+    assert "gnss_position: a message came too late for history.window = 0.5 s (1 time)" in inside.report().message
+    assert float(inside.values["window needed (s)"]) > 1.0
+    assert inside.values["gnss_position outside_history"] == "1"
+
+
+@needs_ros
+def test_live_parameters_reach_the_estimator(make):
+    from rclpy.parameter import Parameter
+
+    inside = make()
+    (result,) = inside.node.set_parameters([Parameter("gnss.use_velocity", value=False)])
+    assert result.successful
+    assert inside.node.navigator.parameters.gnss.use_velocity is False
+    (result,) = inside.node.set_parameters([Parameter("gnss.covariance_scale", value=-1.0)])
+    assert not result.successful
+    assert "gnss.covariance_scale" in result.reason
+    assert inside.node.navigator.parameters.gnss.covariance_scale == 1.0
+
+
+@needs_ros
+def test_no_bytes_on_any_topic_end_the_node(make, drive):
+    """Random, cut, and damaged messages of every input between good ones: no exception, and finite numbers only."""
+    from rclpy.serialization import deserialize_message, serialize_message
+    from test_node_inputs import serialised
+
+    inside = make()
+    for publisher in inside.node.outputs.publishers:
+        inside.published[publisher.topic_name].clear()
+    random = np.random.default_rng(5)
+    types = {"imu/data": IMU, **{source.name: source.kind.type for source in inside.node.aid_inputs}}
+    assert {"initialpose", *types} == set(inside._callbacks)
+    topics = ("initialpose", *types)
+    for number, message in enumerate(drive[:4000]):
+        inside.play([message])
+        topic = topics[number % len(topics)]
+        pose = topic == "initialpose"
+        data = bytearray(
+            initial_pose(1.0, 2.0, 3.0) if pose else serialised(types[topic], seed=number, stamp=message[0])
+        )
+        kind = random.integers(4)
+        if kind == 0:
+            data[4:] = random.bytes(len(data) - 4)
+        elif kind == 1:
+            data = data[: random.integers(len(data))]
+        elif kind == 2:
+            data[random.integers(len(data))] ^= 1 << int(random.integers(8))
+        else:
+            numbers = int(random.integers(1, 5))
+            data[-8 * numbers :] = np.full(numbers, np.nan).tobytes()
+        inside.give(topic, bytes(data))
+    inside.report()
+    assert len(inside.node.trouble.counts) > 5
+    published = inside.published["/odometry/local"]
+    assert len(published) > 1000
+    from nav_msgs.msg import Odometry
+
+    for data in published:
+        message = deserialize_message(data, Odometry)
+        numbers = np.frombuffer(serialize_message(message)[-37 * 8 :], "<f8")
+        assert np.isfinite(numbers).all()
+        assert np.isfinite(message.pose.covariance).all()
 
 
 def test_trouble_is_a_problem_while_it_is_fresh_and_counted_for_ever() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import random
 import signal
 import struct
@@ -21,6 +22,7 @@ from hypothesis import strategies as st
 from ros_process import Ros, free_domain, needs_ros
 
 import eskf_ros
+from eskf_ros.compiled import COMPILED
 from eskf_ros.filter.layout import ODOMETRY, allocate
 from eskf_ros.node.cdr import ImuReader, LayoutError, OdometryMessageWriter, OdometryWriter, imu_from_message
 from eskf_ros.node.clocks import Stamp, StampMonitor, clock_complaints
@@ -771,7 +773,7 @@ def test_a_signal_while_the_node_is_made_ends_at_once(ros: Ros, tmp_path: Path) 
     script.write_text(NODE.replace('super().__init__("echo")', slow))
     process = ros.spawn([script])
     ros.until(lambda: "1" in process.output, what="the node to be under way")
-    assert process.stop(signal.SIGTERM, timeout=5.0) == 0
+    assert process.stop(signal.SIGTERM, timeout=30.0) == 0
     assert process.output == "1\n"
 
 
@@ -832,6 +834,31 @@ def test_parameters_change_over_the_network(ros: Ros, tmp_path: Path) -> None:
     ros.node.destroy_client(client)
     assert process.stop() == 0
     assert process.output == "3.0\n"
+
+
+@pytest.mark.skipif(not COMPILED, reason="the kernels run uncompiled here")
+def test_compiling_is_told_and_loading_from_the_cache_is_not(tmp_path: Path) -> None:
+    script = tmp_path / "doubled.py"
+    script.write_text(
+        textwrap.dedent("""
+            from eskf_ros.compiled import njit, while_compiling
+
+            @njit
+            def doubled(x):
+                return 2 * x
+
+            told = []
+            with while_compiling(told.append):
+                doubled(1.0), doubled(1), doubled(2.0)
+            doubled(1j)
+            print(told)
+            """)
+    )
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
+    environment["PYTHONPATH"] = str(Path(eskf_ros.__file__).parent.parent)
+    for expected in ("[1, 2]\n", "[]\n"):
+        command = [sys.executable, str(script)]
+        assert subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout == expected
 
 
 def test_catching_signals_costs_no_import_of_ros() -> None:

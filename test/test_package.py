@@ -33,7 +33,7 @@ ROS_PACKAGES = {
     "tf2_msgs",
 }
 # Used where somebody else has installed it.
-OPTIONAL = {"robot_localization"}
+OPTIONAL = {"robot_localization", "pygeomag"}
 # Import name -> rosdep key that brings it, where it is not python3-NAME.
 ROSDEP_KEYS = {
     "lz4": "mcap-ros2-support",

@@ -25,8 +25,10 @@ from eskf_ros.gnss.weighting import DEFAULT_WEIGHTING
 Array = NDArray[np.float64]
 
 MOUNT = {"imu__mount_position": [0.3, 0.1, -0.2], "imu__mount_rpy_deg": [10.0, -20.0, 130.0]}
-SETTINGS = make_settings(mode="tight", gnss__lever_arm=[0.8, -0.2, 1.4], **MOUNT)
-LONG_ARM = make_settings(mode="tight", gnss__lever_arm=[25.0, -12.0, 8.0], **MOUNT)
+WHITE = {"mode": "tight", "ranges__correlation_time": 0.0}
+SETTINGS = make_settings(**WHITE, gnss__lever_arm=[0.8, -0.2, 1.4], **MOUNT)
+LASTING = make_settings(mode="tight", ranges__correlation_time=60.0, ranges__correlated_std=2.5, **MOUNT)
+LONG_ARM = make_settings(**WHITE, gnss__lever_arm=[25.0, -12.0, 8.0], **MOUNT)
 KLOBUCHAR = np.array([1.77e-8, 2.235e-8, -1.192e-7, -5.96e-8, 1.27e5, 1.475e5, -1.966e5, -1.966e5])
 
 CLOCK = int(SETTINGS["clock_at"])
@@ -127,7 +129,7 @@ def test_jacobian_of_range_rate(seed: int, far: float, settings: Any, flags: int
 @pytest.mark.parametrize("has_model", [True, False])
 def test_prediction_and_noise_are_those_of_the_range_model(seed: int, flags: int, has_model: bool) -> None:
     """The innovation is what another implementation leaves of the measurement, less clock and offset."""
-    settings = make_settings(mode="tight", gnss__lever_arm=[0.8, -0.2, 1.4], **MOUNT)
+    settings = make_settings(**WHITE, gnss__lever_arm=[0.8, -0.2, 1.4], **MOUNT)
     klobuchar = KLOBUCHAR if has_model else NO_KLOBUCHAR
     state = tight_state(seed)
     payload, work = signal_payload(state, seed, 25.0, flags), make_work()
@@ -166,7 +168,7 @@ def test_prediction_and_noise_are_those_of_the_range_model(seed: int, flags: int
 
 def test_given_standard_deviations_are_scaled_and_floored() -> None:
     settings = make_settings(
-        mode="tight", ranges__covariance_scale=4.0, ranges__code_std_floor=2.0, ranges__range_rate_std_floor=0.1
+        **WHITE, ranges__covariance_scale=4.0, ranges__code_std_floor=2.0, ranges__range_rate_std_floor=0.1
     )
     state, work = tight_state(0), make_work()
     payload = signal_payload(state, 0)
@@ -215,6 +217,25 @@ def test_each_constellation_has_an_offset_of_its_own_and_gps_none() -> None:
     assert (work["jacobian"][0, OFFSETS:] == 0.0).all()
 
 
+@seeds
+def test_what_lasts_moves_the_antenna_that_the_satellites_see(seed: int) -> None:
+    """By its standard deviation times the state; its columns are those of the position times that."""
+    state, work, plain = random_state(seed), make_work(), make_work()
+    optional.join(state, LASTING["reach"][Stream.PSEUDORANGE], LASTING)
+    place = int(LASTING["position_error_at"])
+    payload = signal_payload(state, seed)
+    pseudorange.linearize(state, payload, GPS, LASTING, plain)
+    np.testing.assert_allclose(
+        plain["jacobian"][0, place : place + 3], 2.5 * plain["jacobian"][0, :3], rtol=1e-12, atol=0.0
+    )
+    lasting = np.random.default_rng(seed).normal(size=3)
+    state["optional"][place - ERROR_SIZE : place - ERROR_SIZE + 3] = lasting
+    pseudorange.linearize(state, payload, GPS, LASTING, work)
+    change = work["innovation"][0] - plain["innovation"][0]
+    assert change == pytest.approx(-2.5 * plain["jacobian"][0, :3] @ lasting, abs=1e-7)
+    assert SETTINGS["position_error_at"] == NOWHERE
+
+
 def test_loose_has_neither_clock_nor_offsets() -> None:
     loose = make_settings()
     assert loose["clock_at"] == loose["inter_system_at"] == NOWHERE
@@ -226,7 +247,13 @@ def test_loose_has_neither_clock_nor_offsets() -> None:
 def test_clock_between_epochs(steps: int) -> None:
     """Bias integrates drift, and the covariance is that of the continuous process, in steps of any length."""
     bias_noise, drift_noise, time = 0.1, 0.3, 2.0
-    settings = make_settings(mode="tight", ranges__clock_bias_noise=bias_noise, ranges__clock_drift_noise=drift_noise)
+    settings = make_settings(
+        **WHITE,
+        ranges__clock_bias_noise=bias_noise,
+        ranges__clock_drift_noise=drift_noise,
+        estimate__mounting_random_walk=0.0,
+        estimate__wheel_scale_random_walk=0.0,
+    )
     state = random_state(5)
     size = CLOCK + 2
     optional.join(state, size, settings)

@@ -74,7 +74,10 @@ def test_tight_from_the_recording(folder: Path) -> None:
     # What models leave of atmosphere and orbits changes in half an hour: it stays.
     assert result["error"]["horizontal"]["p50"] < 2.5
     assert result["error"]["speed"]["p50"] < 0.1
+    assert 0.3 < result["nees"]["position"]["mean"] < 8.0
     assert result["warnings"] == []
+    unmodelled = with_parameters(folder, "ranges:", "  correlation_time: 0.0")
+    assert replay(folder / "ranges.mcap", *TIGHT, config=unmodelled)["nees"]["position"]["mean"] > 12.0
 
 
 def test_the_mode_is_a_parameter_too(folder: Path) -> None:
@@ -141,6 +144,15 @@ def test_missing_ephemerides_are_named_with_the_remedy(folder: Path) -> None:
     assert with_file["warnings"] == []
 
 
+def test_missing_parameters_of_the_ionosphere_are_named(folder: Path) -> None:
+    bare = folder / "no_ionosphere.nav"
+    lines = SKY.read_text(encoding="ascii").splitlines(keepends=True)
+    bare.write_text("".join(line for line in lines if "IONOSPHERIC" not in line), encoding="ascii")
+    result = replay(folder / "plain.mcap", "--ranges", str(folder / "rover.obs"), "--nav", str(bare))
+    assert any("ionosphere" in line for line in result["warnings"])
+    assert result["error"]["horizontal"]["p50"] < 5.0
+
+
 def test_what_does_not_fit_is_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plain = str(folder / "plain.mcap")
     text = refusal(capsys, [plain, *TIGHT])
@@ -160,3 +172,6 @@ def test_every_signal_has_its_row(folder: Path) -> None:
     lines = (folder / "out" / "ranges_eskf" / "aids.csv").read_text().splitlines()[1:]
     names = [line.split(",")[2] for line in lines]
     assert names.count(Stream.PSEUDORANGE.name.lower()) == names.count(Stream.RANGE_RATE.name.lower()) > 1000
+    sources = {line.split(",")[-1] for line in lines}
+    assert {source[0] for source in sources} == set("GEC")
+    assert {source[3:] for source in sources if source[0] == "G"} == {" 1C"}

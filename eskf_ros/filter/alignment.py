@@ -1,4 +1,7 @@
-"""Start-up: level from gravity, position from the first fix, heading from a parameter or from acceleration and course.
+"""Start-up: level from gravity, position from the first fix, heading from what there is.
+
+In this order: a parameter or the memory of the last run, a sensor that tells it (``heading_hints``), or acceleration
+(``heading_search``), sharpened by the course.
 
 While the heading is unknown its error has the variance of a half turn and is not estimated: GNSS moves position and
 velocity only (``strapdown.step`` cuts the coupling), the gyros carry the attitude. Every still window until the
@@ -37,6 +40,7 @@ from eskf_ros.filter.layout import (
 )
 from eskf_ros.filter.monitors import watch_input
 from eskf_ros.filter.strapdown import gravity_map
+from eskf_ros.filter.sway import can_be_bias, note_sway
 from eskf_ros.filter.track import forget_tracks
 from eskf_ros.filter.warm_start import do_biases_hold
 from eskf_ros.rotation import (
@@ -71,6 +75,9 @@ REST_TOLERANCE = 0.2
 
 REST_RATE_SIGMAS = 4.0
 """The mean rate at rest is the bias within this many sigma."""
+
+DRIFTED = 2.0
+"""Levelling on the way is worth it when it makes the variance of the tilt smaller by this factor."""
 
 STRONGEST_START = 5.0
 """No robot gathers speed faster (m/s2)."""
@@ -373,6 +380,13 @@ def level(state, sums, count, interval, still, settings):
         bias, start_rate = (b[0], b[1], b[2]), (r[0], r[1], r[2])
         accel_bias_variance = settings.remembered_accel_bias_std**2
         gyro_bias_variance = settings.remembered_gyro_bias_std**2
+    if still and not can_be_bias(rate, start_rate, math.sqrt(gyro_bias_variance), mean_rate_std(duration, settings)):
+        # A slow turn, or a bias that nobody expected: what is not known to be rest has to wait as if it were motion.
+        state.still_stamp = NEVER
+        state.still_count = 0
+        if state.level_known == 1 or (state.stamp - state.first_stamp) * 1e-9 < settings.moving_start_after:
+            return
+        still = False
     force = (force[0] - bias[0], force[1] - bias[1], force[2] - bias[2])
     strength = math.sqrt(dot(force, force))
     if strength < 0.5 * STANDARD_GRAVITY:
@@ -389,8 +403,10 @@ def level(state, sums, count, interval, still, settings):
             covariance[i, j] = 0.0
             covariance[j, i] = 0.0
     if still:
+        note_sway(state, count == state.window_count, settings)
         walked = settings.accel_bias_random_walk**2 * duration / 3.0
-        tilt_noise = (settings.accel_noise_density**2 / duration + walked) / strength**2
+        swayed = state.sway_force * min(1.0, settings.static_duration / duration)
+        tilt_noise = (settings.accel_noise_density**2 / duration + walked + swayed) / strength**2
     else:
         turn_rate_square = (sums[3] ** 2 + sums[4] ** 2 + sums[5] ** 2) / count**2
         tilt_noise = settings.moving_tilt_std**2 + turn_rate_square * (UNKNOWN_SPEED / strength) ** 2
@@ -423,13 +439,39 @@ def level(state, sums, count, interval, still, settings):
 
 
 @njit
+def level_again(state, settings):
+    """Level on the way, at the end of a window, when the gyros have drifted further than such a level is wrong.
+
+    Of a robot that is never at rest the gyro bias is not known, and without a heading GNSS tells nothing of the tilt.
+    """
+    is_end = state.window_start == NEVER and state.window_count > 0
+    if not is_end or state.level_known == 0 or state.heading_known == 1 or state.still_stamp == state.stamp:
+        return
+    n = state.window_count
+    rate_square = (state.window_sum[3] ** 2 + state.window_sum[4] ** 2 + state.window_sum[5] ** 2) / n**2
+    fresh = settings.moving_tilt_std**2 + rate_square * (UNKNOWN_SPEED / STANDARD_GRAVITY) ** 2
+    drifted = max(state.covariance[ATTITUDE, ATTITUDE], state.covariance[ATTITUDE + 1, ATTITUDE + 1])
+    if drifted > DRIFTED * fresh:
+        level(state, state.window_sum, n, settings.static_duration / n, False, settings)
+
+
+@njit
+def mean_rate_std(duration, settings):
+    """Return by how much (rad/s) the mean rate over ``duration`` (s) at rest differs from the gyro bias at the end."""
+    white = settings.gyro_noise_density**2 / duration
+    return math.sqrt(white + settings.gyro_bias_random_walk**2 * duration / 3.0)
+
+
+@njit
 def set_gyro_bias(state, prior_bias, prior, mean_rate, rotation, up, duration, still, settings):
     """Estimate the gyro bias from the mean rate at rest; what is not known of the Earth rate enters its sigma.
 
     The prior (``prior_bias``, rad/s, IMU axes, with variance ``prior``) and the mean are weighed along the vertical
     and across it, because without heading only the vertical part of the Earth rate is known.
     """
-    noise = settings.gyro_noise_density**2 / duration + settings.gyro_bias_random_walk**2 * duration / 3.0
+    noise = mean_rate_std(duration, settings) ** 2
+    if still:
+        noise += state.sway_rate * min(1.0, settings.static_duration / duration)
     earth = state.earth_rate_map
     vertical_rate = dot(up, earth)
     horizontal_square = dot(earth, earth) - vertical_rate**2

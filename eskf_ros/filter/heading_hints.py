@@ -12,7 +12,7 @@ import math
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment import heading_of, set_heading
 from eskf_ros.filter.heading_search import turn_found
-from eskf_ros.filter.layout import GYRO_BIAS, Stream
+from eskf_ros.filter.layout import ERROR_SIZE, GYRO_BIAS, Stream
 from eskf_ros.rotation import wrapped
 
 HEADING = int(Stream.HEADING)
@@ -46,6 +46,8 @@ def is_heading_told(state, aid, settings, work):
     if aid.stream == HEADING:
         rank = DUAL_ANTENNA if aid.source == 0 else IMU_ORIENTATION
     turn, std = work.innovation[0], math.sqrt(work.noise[0, 0])
+    if rank == MAGNETOMETER:
+        std = math.hypot(std, settings.optional_std[settings.mag_error_at - ERROR_SIZE])
     age = (aid.stamp - state.hint_stamp) * 1e-9
     if state.hint_count > 0 and rank > state.hint_rank and age < SILENCE:
         return False
@@ -74,4 +76,6 @@ def is_heading_told(state, aid, settings, work):
         return False
     set_heading(state, heading_of(state, settings) + turn, OPEN_STD, settings)
     state.heading_known = 1
+    # This turn is none that the vehicle made.
+    state.mag_heading = heading_of(state, settings)
     return True

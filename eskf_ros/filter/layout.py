@@ -32,6 +32,8 @@ OPTIONAL_SIZES = {
     "inter_system": 6,
     "baro_offset": 1,
     "baro_scale": 1,
+    "mag_error": 1,
+    "magnetic_bias": 3,
 }
 """Optional errors behind the core, and how many each is: see ``optional``.
 
@@ -228,6 +230,16 @@ STATE = np.dtype(
         ("still_stamp", "i8"),
         ("still_count", "i8"),
         ("still_sum", "f8", (6,)),
+        # The window in parts (see ``sway``): the one being filled, sums of the means of the others; the largest
+        # variances of these means in the run.
+        ("part_start", "i8"),
+        ("part_count", "i8"),
+        ("part_sum", "f8", (6,)),
+        ("parts", "i8"),
+        ("part_mean_sum", "f8", (6,)),
+        ("part_square_sum", "f8", (6,)),
+        ("sway_force", "f8"),
+        ("sway_rate", "f8"),
         # IMU samples since the last point on the grid of the constraints: the point after them, whether one is missing,
         # how many, sums.
         ("block_end", "i8"),
@@ -246,10 +258,17 @@ STATE = np.dtype(
         ("tilted_windows", "i8"),
         ("tilted_force", "f8", (3,)),
         ("fast_windows", "i8"),
-        # Monitors of the heading: sums of cosine and sine, and how many. Messages of the dual antenna against the
-        # estimate; course over ground against the estimate.
-        ("heading_contrast", "f8", (3,)),
+        # Still windows in a row with the same mean rate (rad/s), which is too large for a bias.
+        ("biased_windows", "i8"),
+        ("biased_rate", "f8", (3,)),
+        # Monitors of the heading: sums of cosine and sine, and how many. Messages of the dual antenna and of the
+        # magnetometer against the estimate; course over ground against the estimate.
+        ("heading_contrast", "f8", (2, 3)),
         ("course_contrast", "f8", (3,)),
+        # Strength (T) and inclination (rad) of the field last measured, how many were disturbed, and how many were.
+        ("field_found", "f8", (2,)),
+        ("disturbed_fields", "f8"),
+        ("fields", "f8"),
         # When absolute aids were last accepted, how many were rejected since, and how often that ended in a restart.
         ("absolute_stamp", "i8"),
         ("absolute_interval", "i8"),
@@ -277,6 +296,15 @@ STATE = np.dtype(
         ("heading_mark_stamp", "i8"),
         ("heading_mark_std", "f8"),
         ("heading_stuck", "i8"),
+        # The Earth's magnetic field where the last good fix was (rad, rad, T; strength 0: unknown), whether it is
+        # known, when it was last found disturbed; heading and place since which its error is another.
+        ("field_declination", "f8"),
+        ("field_inclination", "f8"),
+        ("field_strength", "f8"),
+        ("field_known", "i8"),
+        ("disturbed_stamp", "i8"),
+        ("mag_heading", "f8"),
+        ("mag_position", "f8", (3,)),
         # Tight coupling: whether the errors of clock bias and drift have values yet, milliseconds it has jumped by,
         # and how often most of the satellites contradicted the state.
         ("clock_known", "i8", (2,)),
@@ -405,6 +433,11 @@ SETTINGS = np.dtype(
         ("gnss_time_offset", "f8", (SOURCES,)),
         ("heading_lines_body", "f8", (SOURCES, 3)),
         ("baro_arm_body", "f8", (3,)),
+        ("mag_to_imu", "f8", (3, 3)),
+        ("mag_strength_tolerance", "f8"),
+        ("mag_inclination_tolerance", "f8"),
+        ("mag_error_distance", "f8"),
+        ("is_orientation_magnetic", "i8"),
         ("correlated_share", "f8"),
         ("wheel_arm_body", "f8", (3,)),
         ("wheel_slip", "f8"),
@@ -413,11 +446,12 @@ SETTINGS = np.dtype(
         ("nhc_vertical_std", "f8"),
         ("nhc_angle_std", "f8"),
         ("nhc_slip", "f8"),
-        # Ranges: lowest elevation (rad), factor on variances, floors (m, m/s).
+        # Ranges: lowest elevation (rad), factor on variances, floors (m, m/s), what lasts in their errors (m).
         ("elevation_mask", "f8"),
         ("range_covariance_scale", "f8"),
         ("code_std_floor", "f8"),
         ("range_rate_std_floor", "f8"),
+        ("range_error_std", "f8"),
         ("gate", "f8", (len(Stream), 4)),
         ("reach", "i8", (len(Stream),)),
         ("constrains", "i8", (len(Stream),)),
@@ -552,16 +586,8 @@ _MONITORS = ("fault_stamp", "departure_stamp", "seen_stamp", "heading_mark_stamp
 def blank_state() -> np.ndarray:
     """Return the state before the first IMU sample."""
     state = allocate(STATE)
-    for field in (
-        "stamp",
-        "imu_stamp",
-        "first_stamp",
-        "window_start",
-        "absolute_stamp",
-        *_EVIDENCE,
-        *_RECOVERY,
-        *_MONITORS,
-    ):
+    stamps = ("stamp", "imu_stamp", "first_stamp", "window_start", "absolute_stamp", "disturbed_stamp")
+    for field in (*stamps, *_EVIDENCE, *_RECOVERY, *_MONITORS):
         state[field] = NEVER
     state["scatter"] = state["scatter_paid"] = 1.0
     state["attitude"][0, 0] = 1.0

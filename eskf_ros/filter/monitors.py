@@ -8,7 +8,11 @@ import numpy as np
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import STANDARD_GRAVITY
+from eskf_ros.filter.layout import Stream
+from eskf_ros.filter.sway import can_be_bias
 from eskf_ros.rotation import dot, rotate, wrapped
+
+MAG = int(Stream.MAG)
 
 NO_GRAVITY = 0.5
 """Below this part of gravity on average the accelerometer cannot be a strapdown one in m/s2, at rest or not."""
@@ -18,6 +22,10 @@ UPRIGHT_COSINE = 0.7
 FASTEST_TURN = 15.0
 """At rest gravity is within this part of its value and within 45 degrees of the z axis of base_link; nothing that
 navigates turns this fast (rad/s) for seconds."""
+
+SAME_RATE = 0.1
+BIASED_WINDOWS = 3
+"""A rate that changes by less than this part from window to window, through so many, is a bias: nothing turns so."""
 
 MEMORY = 0.99
 LASTING_COUNT = 40.0
@@ -42,6 +50,7 @@ def watch_input(state, still, settings):
         state.odd_gravity_windows += 1
         state.odd_gravity = strength
     elif still:
+        watch_bias(state, rate, settings)
         state.rest_windows += 1
         force_base = rotate(settings.imu_to_base, force)
         if force_base[2] < UPRIGHT_COSINE * strength:
@@ -50,6 +59,22 @@ def watch_input(state, still, settings):
                 state.tilted_force[i] = force_base[i]
     if math.sqrt(dot(rate, rate)) > FASTEST_TURN:
         state.fast_windows += 1
+
+
+@njit
+def watch_bias(state, rate, settings):
+    """Count still windows in a row with one mean rate (rad/s) that is too large for what is expected of the bias."""
+    nothing = (0.0, 0.0, 0.0)
+    if can_be_bias(rate, nothing, settings.gyro_bias_std, 0.0):
+        state.biased_windows = 0
+        return
+    last = state.biased_rate
+    change = (rate[0] - last[0], rate[1] - last[1], rate[2] - last[2])
+    if dot(change, change) > SAME_RATE**2 * dot(rate, rate):
+        state.biased_windows = 0
+    state.biased_windows += 1
+    for i in range(3):
+        state.biased_rate[i] = rate[i]
 
 
 @njit
@@ -62,9 +87,17 @@ def note_contrast(sums, angle):
 
 @njit
 def watch_heading(state, aid, work):
-    """Compare a yaw of the dual antenna, described by ``work``, with the estimate."""
+    """Compare a heading of the dual antenna or the magnetometer, described by ``work``, with the estimate."""
     if aid.source == 0 and state.heading_known == 1 and aid.payload[3] > 0.0:
-        note_contrast(state.heading_contrast, work.innovation[0])
+        kind = 1 if aid.stream == MAG else 0
+        note_contrast(state.heading_contrast[kind], work.innovation[0])
+
+
+@njit
+def watch_field(state, is_disturbed):
+    """Count the readings of the magnetometer that cannot be the Earth's field; the counts forget."""
+    state.fields = MEMORY * state.fields + 1.0
+    state.disturbed_fields = MEMORY * state.disturbed_fields + (1.0 if is_disturbed else 0.0)
 
 
 @njit
@@ -88,14 +121,29 @@ def _lasting_difference(sums: np.ndarray) -> float | None:
 
 def _heading_complaints(state: np.void) -> list[str]:
     found = []
-    difference = _lasting_difference(state["heading_contrast"])
+    if state["disturbed_fields"] > max(LASTING_COUNT, ALIKE * float(state["fields"])):
+        strength, inclination = (float(value) for value in state["field_found"])
+        found.append(
+            f"the magnetic field is {strength * 1e6:.0f} uT and dips by {math.degrees(inclination):.0f} deg, that of "
+            f"the Earth is {float(state['field_strength']) * 1e6:.0f} uT and dips by "
+            f"{math.degrees(state['field_inclination']):.0f} deg: does mag.mount_rpy_deg match its axes (a driver may "
+            "give north-east-down), is it in T, and is it calibrated?"
+        )
+    dual_antenna, magnetometer = state["heading_contrast"]
+    difference = _lasting_difference(magnetometer)
+    if difference is not None:
+        found.append(
+            f"the headings of the magnetometer differ from the estimate by {difference:.0f} deg: does "
+            "mag.mount_rpy_deg match its axes (a driver may give north-east-down), and is it calibrated?"
+        )
+    difference = _lasting_difference(dual_antenna)
     if difference is not None:
         found.append(
             f"the headings of the dual antenna differ from the estimate by {difference:.0f} deg: are the antennas "
             "swapped, does heading.mount_rpy_deg match the baseline, and is yaw 0 = east, counter-clockwise?"
         )
     difference = _lasting_difference(state["course_contrast"])
-    if difference is not None and state["heading_contrast"][2] > 0.0:
+    if difference is not None and dual_antenna[2] > 0.0:
         found.append(
             f"the vehicle travels at {difference:.0f} deg to the heading of the dual antenna: are the antennas "
             "swapped, does heading.mount_rpy_deg match the baseline, and is yaw 0 = east, counter-clockwise? "
@@ -115,6 +163,12 @@ def complaints(state: np.void) -> list[str]:
         elif abs(strength - 1.0) < GRAVITY_TOLERANCE:
             cause = "it is in units of g; REP-103 wants m/s2"
         found.append(f"the accelerometer reads {strength:.2f} m/s2 where gravity is {STANDARD_GRAVITY:.2f}: {cause}")
+    if state["biased_windows"] >= BIASED_WINDOWS:
+        x, y, z = np.degrees(state["biased_rate"])
+        found.append(
+            f"at rest the gyro reads ({x:.2f}, {y:.2f}, {z:.2f}) deg/s, more than imu.gyro_bias_std allows for: raise "
+            "it, or calibrate the gyro"
+        )
     if state["tilted_windows"] > max(1, int(state["rest_windows"]) // 4):
         x, y, z = (float(value) for value in state["tilted_force"])
         found.append(

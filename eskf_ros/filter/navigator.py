@@ -12,9 +12,10 @@ import numpy.typing as npt
 from eskf_ros.compiled import njit
 from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
 from eskf_ros.filter.aid_monitors import aid_complaints, watch_aid
-from eskf_ros.filter.aiding import baro, gnss_position, gnss_velocity, heading, nhc, wheel
+from eskf_ros.filter.aiding import baro, gnss_position, gnss_velocity, heading, mag, nhc, wheel
 from eskf_ros.filter.alignment import (
     heading_of,
+    level_again,
     move_datum,
     note_position,
     note_velocity,
@@ -47,7 +48,7 @@ from eskf_ros.filter.layout import (
     blank_state,
 )
 from eskf_ros.filter.local import carry, measure_step, note_jump
-from eskf_ros.filter.monitors import complaints, watch_course, watch_heading
+from eskf_ros.filter.monitors import complaints, watch_course, watch_field, watch_heading
 from eskf_ros.filter.optional import join
 from eskf_ros.filter.output import status_of, write_odometry
 from eskf_ros.filter.ranges import end_of_epoch, fuse_ranges, is_range, offer_signals
@@ -55,6 +56,7 @@ from eskf_ros.filter.recovery import gate_of, phase_of, recover, watch_solution
 from eskf_ros.filter.settings import intakes_from, settings_from
 from eskf_ros.filter.stillness import add_to_block, watch_wheels
 from eskf_ros.filter.strapdown import SECOND, propagate
+from eskf_ros.filter.sway import add_to_part
 from eskf_ros.filter.timeline import (
     CHECKPOINT_SPACING,
     doubled,
@@ -70,11 +72,13 @@ from eskf_ros.filter.timeline import (
 from eskf_ros.filter.track import follow
 from eskf_ros.filter.update import update
 from eskf_ros.filter.warm_start import Memory, recall
+from eskf_ros.filter.wheel_heading import search_with_wheels
 from eskf_ros.gnss.measurements import MEASURED_SIGNAL
 from eskf_ros.gnss.range_model import NO_KLOBUCHAR
 from eskf_ros.gnss.ranges import Status as RangeStatus
 from eskf_ros.gnss.ranges import status_counts
 from eskf_ros.gnss.time import SECONDS_PER_WEEK, Instant
+from eskf_ros.magnetic_model import FieldUnknown, field_at
 from eskf_ros.parameters import Parameters
 from eskf_ros.rotation import to_matrix
 
@@ -86,10 +90,12 @@ GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
 WHEEL = int(Stream.WHEEL)
 NHC = int(Stream.NHC)
 HEADING = int(Stream.HEADING)
+MAG = int(Stream.MAG)
 BARO = int(Stream.BARO)
 OPEN_DOOR = int(Verdict.WAITING)
 FIRST_CONSTRAINT = int(min(CONSTRAINTS))
 FUSED = int(Verdict.FUSED)
+GATE = int(Verdict.GATE)
 BEFORE_ALIGNMENT = int(Verdict.BEFORE_ALIGNMENT)
 INACTIVE = int(Verdict.INACTIVE)
 
@@ -100,6 +106,9 @@ IMU_BATCH = 1024
 
 HIGHEST_ALTITUDE = 1e5
 """What no receiver on a robot reports (m)."""
+
+ORIENTATION_SHARE = SECOND // 20
+"""Of each second so much (ns) of what the IMU says of its orientation is used."""
 
 DIAGONAL = np.eye(3).ravel()
 
@@ -128,7 +137,9 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
         predict(state, sample.stamp, sample, settings, work)
         take_sample(state, sample)
         measure_step(state, settings)
+        add_to_part(state)
         watch_stillness(state, settings)
+        level_again(state, settings)
         add_to_block(state, settings)
         save_checkpoint(states, checkpoints, t)
 
@@ -200,7 +211,13 @@ def fuse(state, aids, i, settings, work):
         note_velocity(state, aid, settings)
         watch_course(state, aid, heading_of(state, settings), settings)
     if not is_aligned_for(state, aid.stream):
+        if aid.stream == WHEEL:
+            search_with_wheels(state, aid.payload, settings.gate[WHEEL, 2], settings, work)
+            watch_wheels(state, aid)
         aid.verdict = BEFORE_ALIGNMENT if aid.stream < FIRST_CONSTRAINT else INACTIVE
+        return
+    if aid.stream == HEADING and aid.source == heading.IMU_ORIENTATION and state.heading_known == 1:
+        aid.verdict = INACTIVE
         return
     if state.position_known == 0 and aid.stream == GNSS_POSITION:
         begin(state, aid, settings)
@@ -208,11 +225,18 @@ def fuse(state, aids, i, settings, work):
     heading_before = heading_of(state, settings)
     join(state, settings.reach[aid.stream], settings)
     watch_solution(state, aid, settings)
+    if aid.stream == MAG:
+        mag.note_way(state, heading_before, settings)
+        is_disturbed = mag.is_disturbed(state, aid, settings)
+        watch_field(state, is_disturbed)
+        if is_disturbed:
+            aid.verdict = GATE
+            return
     size = linearize(state, aid, settings, work)
     if size == 0:
         aid.verdict = INACTIVE
         return
-    if aid.stream == HEADING:
+    if aid.stream in (HEADING, MAG):
         watch_heading(state, aid, work)
         if state.heading_known == 0:
             if not is_heading_told(state, aid, settings, work):
@@ -229,7 +253,9 @@ def fuse(state, aids, i, settings, work):
     watch_aid(state, aid, size, gate, work, settings)
     if aid.verdict == FUSED and state.heading_known == 0:
         search_heading(state, aid, gate, settings, work)
-    if aid.stream == WHEEL:
+    if aid.stream == GNSS_POSITION:
+        mag.note_field(state, aid)
+    elif aid.stream == WHEEL:
         watch_wheels(state, aid)
     note_jump(state, position, heading_before, settings)
 
@@ -253,6 +279,8 @@ def is_aligned_for(state, stream):
         return True
     if stream in (GNSS_VELOCITY, HEADING, BARO):
         return state.position_known == 1
+    if stream == MAG:
+        return state.position_known == 1 and state.field_known == 1
     return state.position_known == 1 and state.heading_known == 1
 
 
@@ -270,6 +298,8 @@ def linearize(state, aid, settings, work):
         return nhc.linearize(state, settings, work)
     if aid.stream == HEADING:
         return heading.linearize(state, aid.payload, aid.source, settings, work)
+    if aid.stream == MAG:
+        return mag.linearize(state, aid.payload, settings, work)
     if aid.stream == BARO:
         return baro.linearize(state, aid.payload, aid.source, settings, work)
     return gnss_velocity.linearize(state, aid.payload, aid.source, settings, work)
@@ -306,6 +336,7 @@ class Navigator:
         self.parameters = parameters
         self._settings = settings_from(parameters, self._output_rate)
         self._intakes = intakes_from(parameters)
+        self._needs_field = parameters.mag.use or parameters.alignment.imu_orientation == "magnetic_north"
         if self._memory is not None:
             recall(*self._memory, parameters, self._settings[0])
 
@@ -329,6 +360,7 @@ class Navigator:
         self._stand_ins = 0
         self.range_statuses: Counter[RangeStatus] = Counter()
         """What became of the signals before they entered the timeline: how many are usable, and why others are not."""
+        self._field_problem = ""
 
     def warm_start(self, memory: Memory, age: float) -> None:
         """Offer what an earlier run knew, ``age`` seconds ago; to be called before the first sample."""
@@ -457,6 +489,8 @@ class Navigator:
             abs(latitude_deg) > 90.0 or abs(longitude_deg) > 360.0 or abs(altitude) > HIGHEST_ALTITUDE
         ):
             aid["door"] = Verdict.BAD_VALUE
+        elif aid["door"] == Verdict.WAITING and self._needs_field:
+            self._add_field(latitude_deg, longitude_deg, altitude, stamp)
         self._push_gnss(Stream.GNSS_POSITION, stamp, arrival, frame_id)
 
     def push_gnss_velocity(
@@ -531,6 +565,30 @@ class Navigator:
                 self._note_refused(stream, stamp)
         if count:
             self._refused.append(refused[:count])
+
+    def push_imu_orientation(self, stamps: StampArray, orientation: FloatArray, covariance: FloatArray) -> None:
+        """Take what samples of `push_imu` say of the IMU's orientation: (n, 4) x y z w and (n, 9) rad2, as in REP-145.
+
+        Nothing happens unless ``alignment.imu_orientation`` asks for it; then the first few of each second are enough:
+        which these are must not depend on the order in which they come.
+        """
+        alignment = self.parameters.alignment
+        if alignment.imu_orientation == "unused":
+            return
+        forward_imu = self._settings["imu_to_base"][0, 0]
+        for i in np.flatnonzero(covariance[:, 0] != ABSENT):
+            stamp = int(stamps[i])
+            if stamp % SECOND >= ORIENTATION_SHARE:
+                continue
+            x, y, z, w = (float(value) for value in orientation[i])
+            yaw = math.nan
+            if abs(x * x + y * y + z * z + w * w - 1.0) < 0.1:
+                forward = np.array(to_matrix((w, x, y, z))) @ forward_imu
+                yaw = math.atan2(forward[1], forward[0])
+            std = math.radians(alignment.imu_orientation_std_deg)
+            given = np.diag([covariance[i, 8], ABSENT, ABSENT]).ravel()
+            admit(self._offered, (yaw, 0.0, 0.0), given, NO_STAND_IN, 1.0, (std, std, std), True)
+            self._push_aid(Stream.HEADING, stamp, stamp, heading.IMU_ORIENTATION)
 
     def take_records(self) -> np.ndarray:
         """Return the records (RECORD) that became final since the last call: in the total order, the too late last."""
@@ -633,6 +691,8 @@ class Navigator:
     def complaints(self) -> list[str]:
         """What is wrong with whole streams, one sentence each with what to do; empty when nothing is."""
         found = complaints(self._states[0]) + aid_complaints(self._states[0], self._settings[0])
+        if self._field_problem:
+            found.append(self._field_problem)
         if self._stand_ins:
             found.append(
                 f"{self._stand_ins} messages came without a covariance (unknown type or all zero): "
@@ -684,6 +744,20 @@ class Navigator:
             self._stand_ins += 1
         return aid
 
+    def _add_field(self, latitude_deg: float, longitude_deg: float, altitude: float, stamp: int) -> None:
+        """Write the Earth's magnetic field at a fix, a function of the fix alone, to the record that is on offer."""
+        declination = math.radians(self.parameters.mag.declination_deg)
+        try:
+            found, inclination, strength = field_at(latitude_deg, longitude_deg, altitude, stamp)
+        except FieldUnknown as problem:
+            if math.isnan(declination):
+                self._field_problem = str(problem)
+                return
+            found, inclination, strength = declination, 0.0, 0.0
+        if math.isnan(declination):
+            declination = found
+        self._offered[0]["payload"][mag.FIELD : mag.FIELD + 4] = (1.0, declination, inclination, strength)
+
     def _push_gnss(self, stream: Stream, stamp: int, arrival: int, frame_id: str) -> None:
         """Sort the record that is on offer into the timeline, as one of the receiver with this frame."""
         second = self.parameters.second_gnss
@@ -700,6 +774,8 @@ class Navigator:
         aid = self._offered[0]
         aid["source"] = source
         aid["stamp"], aid["arrival"], aid["stream"], aid["verdict"] = stamp, arrival, stream, aid["door"]
+        # So it stays in the record of a measurement that waits in vain.
+        aid["dof"], aid["nis"], aid["innovation"] = 0, math.nan, math.nan
         self._make_room()
         refused = insert_aid(self._aids, self._timeline, self._offered)
         if refused:

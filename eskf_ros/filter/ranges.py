@@ -75,7 +75,12 @@ GATE = int(Verdict.GATE)
 BEFORE_ALIGNMENT = int(Verdict.BEFORE_ALIGNMENT)
 WEIGHED_DOWN = int(Verdict.WEIGHED_DOWN)
 LOW_ELEVATION = int(Verdict.LOW_ELEVATION)
+NON_FINITE = int(Verdict.NON_FINITE)
+BAD_VALUE = int(Verdict.BAD_VALUE)
 USABLE = int(Status.USABLE)
+
+LARGEST_NUMBER = 1e11
+"""Beyond every range, satellite and GPS time (m, m/s, s)."""
 
 MILLISECOND = 1e-3 * SPEED_OF_LIGHT
 JUMP_TOLERANCE = 100.0
@@ -148,6 +153,9 @@ def offer_signals(aids, timeline, offered, signals, stamp, arrival, gps_time, kl
             payload[CN0] = signal["cn0"]
             payload[NOISE_FACTOR] = signal["noise_factor"]
             payload[GPS_TIME] = gps_time
+            if aid.door == WAITING:
+                aid.door = judge_signal(payload)
+                aid.verdict = aid.door
             payload[KLOBUCHAR : KLOBUCHAR + 8] = klobuchar
             verdict = insert_aid(aids, timeline, offered)
             if verdict != WAITING:
@@ -159,6 +167,19 @@ def offer_signals(aids, timeline, offered, signals, stamp, arrival, gps_time, kl
                     record["innovation"][i] = math.nan
                 count += 1
     return count
+
+
+@njit
+def judge_signal(payload):
+    """Return whether the door is open to a signal: its numbers must be some, and no larger than they can be."""
+    largest = max(abs(payload[MEASURED]), abs(payload[GPS_TIME]))
+    for i in range(SATELLITE, SATELLITE_VELOCITY + 3):
+        if math.isnan(payload[i]):
+            return NON_FINITE
+        largest = max(largest, abs(payload[i]))
+    if not math.isfinite(payload[MEASURED] + payload[GPS_TIME] + largest):
+        return NON_FINITE
+    return WAITING if largest < LARGEST_NUMBER else BAD_VALUE
 
 
 @njit

@@ -94,7 +94,7 @@ def watch_solution(state, aid, settings):
     last = state.last_fix_variance[aid.source]
     if max(variance, last) > SAME_SOLUTION * min(variance, last):
         state.scatter[aid.source] = 1.0
-        if settings.position_error_at < state.error_size:
+        if settings.position_error_at < state.error_size and settings.correlated_share > 0.0:
             renew(state, settings.position_error_at, 3, settings)
     state.last_fix_variance[aid.source] = variance
 

@@ -174,16 +174,25 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
     baseline = _matrix(parameters.heading.mount_rpy_deg)[:, 0]
     settings["heading_lines_body"] = np.array([baseline, (1.0, 0.0, 0.0)]) @ imu_to_base
     settings["baro_arm_body"] = np.subtract(parameters.baro.position, imu.mount_position) @ imu_to_base
+    mag = parameters.mag
+    mag_to_base = _matrix(mag.mount_rpy_deg) if mag.mount_rpy_deg else imu_to_base
+    settings["mag_to_imu"] = imu_to_base.T @ mag_to_base
+    settings["mag_strength_tolerance"] = mag.strength_tolerance
+    settings["mag_inclination_tolerance"] = math.radians(mag.inclination_tolerance_deg)
+    settings["mag_error_distance"] = mag.error_distance
+    settings["is_orientation_magnetic"] = alignment.imu_orientation == "magnetic_north"
     for stream, probability in gate_probabilities(parameters).items():
         settings["gate"][0, stream, 1:] = chdtri([1, 2, 3], 1.0 - probability)
     settings["constrains"][0, Stream.ZUPT] = settings["constrains"][0, Stream.ZARU] = parameters.zupt.enabled
     settings["constrains"][0, Stream.NHC] = parameters.nhc.enabled
-    settings["correlated_share"] = parameters.gnss.correlated_share
+    # In mode tight what lasts is in the ranges, and no fix knows of it.
+    settings["correlated_share"] = parameters.gnss.correlated_share if parameters.mode == "loose" else 0.0
     describe_vehicle(settings[0], parameters)
     settings["elevation_mask"] = math.radians(parameters.ranges.elevation_mask_deg)
     settings["range_covariance_scale"] = parameters.ranges.covariance_scale
     settings["code_std_floor"] = parameters.ranges.code_std_floor
     settings["range_rate_std_floor"] = parameters.ranges.range_rate_std_floor
+    settings["range_error_std"] = parameters.ranges.correlated_std
     place_optional_states(settings[0], parameters)
     settings["static_duration"] = alignment.static_duration
     settings["moving_start_after"] = alignment.moving_start_after
@@ -220,11 +229,12 @@ def place_optional_states(settings: np.void, parameters: Parameters) -> None:
     The offsets of the constellations join one by one, with the first signal of each (`ranges`).
     """
     settings["reach"] = end = ERROR_SIZE
-    time, baro = parameters.gnss.correlation_time, parameters.baro
+    baro, mag = parameters.baro, parameters.mag
     estimate = parameters.estimate
     mounting_std, mounting_walk = math.radians(estimate.mounting_std_deg), estimate.mounting_random_walk
     scale_std, scale_walk = estimate.wheel_scale_std, estimate.wheel_scale_random_walk
     ranges, is_tight = parameters.ranges, parameters.mode == "tight"
+    time = ranges.correlation_time if is_tight else parameters.gnss.correlation_time
     clock_noise = (ranges.clock_bias_noise, ranges.clock_drift_noise)
     # Name, whether it is on, first deviation, driving noise, correlation time (0: random walk), streams that need it.
     blocks: tuple[tuple[str, bool, Deviation, Deviation, float, tuple[Stream, ...]], ...] = (
@@ -236,6 +246,8 @@ def place_optional_states(settings: np.void, parameters: Parameters) -> None:
         # Not by whether it is used, which may change while running: places stay.
         ("baro_offset", True, baro.offset_std, baro.offset_random_walk, 0.0, (Stream.BARO,)),
         ("baro_scale", True, baro.scale_std, 0.0, 0.0, (Stream.BARO,)),
+        ("mag_error", True, math.radians(mag.error_std_deg), 0.0, 0.0, (Stream.MAG,)),
+        ("magnetic_bias", estimate.magnetic_bias, estimate.magnetic_bias_std, 0.0, 0.0, (Stream.MAG,)),
     )
     for name, is_on, std, noise_density, time, streams in blocks:
         settings[f"{name}_at"] = end if is_on else NOWHERE

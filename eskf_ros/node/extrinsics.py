@@ -3,33 +3,37 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from eskf_ros.parameters import Parameters, to_mapping
 
-Pose = tuple[np.ndarray, Rotation]
-"""Position (3,) m and orientation of a frame in another."""
+Pose = tuple[np.ndarray, np.ndarray]
+"""Position (3,) m and rotation matrix (3, 3) of a frame in another."""
 
 IMU, ANTENNA, SECOND_ANTENNA = "IMU", "GNSS antenna", "second GNSS antenna"
+MAGNETOMETER, BAROMETER = "magnetometer", "barometer"
 
 
 @dataclass(frozen=True)
 class Place:
     """Where a sensor sits: parameters of its position and orientation (empty: of no account), inputs that name it."""
 
-    position: str
+    position: str = ""
     rotation: str = ""
     inputs: tuple[str, ...] = ()
 
 
 PLACES = {
     IMU: Place("imu.mount_position", "imu.mount_rpy_deg"),
-    ANTENNA: Place("gnss.lever_arm", inputs=("gnss_fix", "gnss_velocity")),
+    # Not by the velocities: many drivers name the axes they are given in.
+    ANTENNA: Place("gnss.lever_arm", inputs=("gnss_fix", "ranges")),
     SECOND_ANTENNA: Place("second_gnss.lever_arm"),
+    MAGNETOMETER: Place(rotation="mag.mount_rpy_deg", inputs=("mag",)),
+    BAROMETER: Place("baro.position", inputs=("baro",)),
 }
 """One row for each sensor whose place in base_link counts."""
 
@@ -45,21 +49,16 @@ class Extrinsics:
     """Collects static transforms and the frames of the sensors, and completes the parameters with what they tell.
 
     Reading is a matter of the first messages: afterwards nothing changes, and nothing is looked up any more.
-
-    Attributes:
-        sensors: those this robot has.
     """
 
     def __init__(self, parameters: Parameters) -> None:
         """`parameters` as somebody gave them: what is not zero there is not looked up."""
         self._base_link = parameters.frames.base_link
         values = to_mapping(parameters)
-        self.sensors = [s for s in PLACES if s != SECOND_ANTENNA or parameters.second_gnss.frame_id]
         self._wanted: set[str] = set()
         if parameters.frames.extrinsics == "auto":
-            for sensor in self.sensors:
-                names = (PLACES[sensor].position, PLACES[sensor].rotation)
-                if not np.any([values[name] for name in names if name]):
+            for sensor, place in PLACES.items():
+                if not any(np.any(values[name]) for name in (place.position, place.rotation) if name):
                     self._wanted.add(sensor)
         self._parents: dict[str, tuple[str, Pose]] = {}
         self._frames: dict[str, list[str]] = {}
@@ -72,12 +71,22 @@ class Extrinsics:
         position = np.array([t.x, t.y, t.z])
         norm = np.linalg.norm(quaternion)
         if np.isfinite(position).all() and 0.5 < norm < 2.0:
-            pose = position, Rotation.from_quat(quaternion / norm)
+            pose = position, matrix_of(*(quaternion / norm))
             self._parents[message.child_frame_id] = message.header.frame_id, pose
 
-    def note_frame(self, sensor: str, frame: str) -> None:
-        """Take note of a frame that a sensor's messages name; the first one that is known counts."""
-        self._frames.setdefault(sensor, []).append(frame)
+    @property
+    def sensors(self) -> list[str]:
+        """Those that every robot has, and those that messages came from."""
+        return [sensor for sensor in PLACES if sensor in (IMU, ANTENNA, *self._frames)]
+
+    def note_frame(self, sensor: str, frame: str) -> bool:
+        """Take note of a frame that a sensor's messages name; the first one that is known counts.
+
+        Says whether it is the first frame of this sensor at all.
+        """
+        frames = self._frames.setdefault(sensor, [])
+        frames.append(frame)
+        return len(frames) == 1
 
     def find(self) -> list[str]:
         """Look for the sensors not found so far; return a line for each that was found now."""
@@ -88,8 +97,9 @@ class Extrinsics:
                 if pose is None or sensor in self._found:
                     continue
                 self._found[sensor] = pose
-                place = " ".join(f"{value:.3f}" for value in pose[0])
-                angles = " ".join(f"{value:.2f}" for value in pose[1].as_euler("xyz", degrees=True))
+                # Plus zero: no sign on a zero.
+                place = " ".join(f"{value:.3f}" for value in np.round(pose[0], 3) + 0.0)
+                angles = " ".join(f"{value:.2f}" for value in np.round(roll_pitch_yaw_deg(pose[1]), 2) + 0.0)
                 lines.append(
                     f"{sensor} in {self._base_link}, from /tf_static by its frame {frame}: "
                     f"position {place} m, roll pitch yaw {angles} deg"
@@ -99,9 +109,10 @@ class Extrinsics:
     def completed(self, parameters: Parameters) -> Parameters:
         """The parameters with the places that were found."""
         for sensor, (position, rotation) in self._found.items():
-            parameters = _changed(parameters, PLACES[sensor].position, position)
+            if PLACES[sensor].position:
+                parameters = _changed(parameters, PLACES[sensor].position, position)
             if PLACES[sensor].rotation:
-                parameters = _changed(parameters, PLACES[sensor].rotation, rotation.as_euler("xyz", degrees=True))
+                parameters = _changed(parameters, PLACES[sensor].rotation, roll_pitch_yaw_deg(rotation))
         return parameters
 
     def source_of(self, sensor: str) -> str:
@@ -116,18 +127,18 @@ class Extrinsics:
         for name, (position, rotation) in self._ancestors(frame).items():
             if name in of_base:
                 base_position, base_rotation = of_base[name]
-                return base_rotation.inv().apply(position - base_position), base_rotation.inv() * rotation
+                return base_rotation.T @ (position - base_position), base_rotation.T @ rotation
         return None
 
     def _ancestors(self, frame: str) -> dict[str, Pose]:
         """The pose of a frame in itself, its parent, and so on upwards."""
-        pose: Pose = np.zeros(3), Rotation.identity()
+        pose: Pose = np.zeros(3), np.eye(3)
         found = {frame: pose}
         while frame in self._parents:
             frame, (position, rotation) = self._parents[frame]
             if frame in found:
                 break
-            pose = position + rotation.apply(pose[0]), rotation * pose[1]
+            pose = position + rotation @ pose[0], rotation @ pose[1]
             found[frame] = pose
         return found
 
@@ -136,3 +147,24 @@ def _changed(parameters: Parameters, name: str, values: np.ndarray) -> Parameter
     group, field = name.split(".")
     changed = dataclasses.replace(getattr(parameters, group), **{field: tuple(values.tolist())})
     return dataclasses.replace(parameters, **{group: changed})
+
+
+def matrix_of(x: float, y: float, z: float, w: float) -> np.ndarray:
+    """The rotation matrix of a unit quaternion."""
+    return np.array(
+        [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+    )
+
+
+def roll_pitch_yaw_deg(matrix: np.ndarray) -> np.ndarray:
+    """Roll, pitch and yaw (3,) of a rotation matrix, about fixed axes; pitch from -90 to 90 degrees."""
+    pitch = math.atan2(-matrix[2, 0], math.hypot(matrix[2, 1], matrix[2, 2]))
+    if math.hypot(matrix[2, 1], matrix[2, 2]) < 1e-9:
+        # Straight up or down: roll and yaw turn about the same axis, and all of it is called yaw.
+        return np.degrees([0.0, pitch, math.atan2(-matrix[0, 1], matrix[1, 1])])
+    roll, yaw = math.atan2(matrix[2, 1], matrix[2, 2]), math.atan2(matrix[1, 0], matrix[0, 0])
+    return np.degrees([roll, pitch, yaw])

@@ -10,8 +10,7 @@ import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 
 from eskf_ros.bags import Batch, StringTable, decode
-from eskf_ros.filter.settings import intakes_from
-from eskf_ros.inputs import INPUTS, Arguments, Input
+from eskf_ros.inputs import Arguments, Input, inputs_of, time_offset_of
 from eskf_ros.node.clocks import SECOND, StampMonitor
 from eskf_ros.parameters import ParameterError, Parameters
 
@@ -29,7 +28,8 @@ class AidInput:
         kind: the row.
         name: of the topic, as the parameters have it.
         message_class: the chosen one, of rclpy.
-        monitors: of the first receiver, and of the second where there is one and it sends on this topic.
+        monitors: of the first receiver, and of the second where there is one and it sends on this topic; none where
+            stamps are no instants of measurements.
     """
 
     def __init__(self, kind: Input, parameters: Parameters, topic: str) -> None:
@@ -44,14 +44,14 @@ class AidInput:
             problem = f"{self._chosen.type} is not installed here: {error}"
             raise ParameterError(f"topics.{kind.name}_type", [problem]) from error
         window = parameters.history.window
-        self.monitors = [StampMonitor(topic, window)]
+        self.monitors = [StampMonitor(topic, window)] if kind.is_timed else []
         if self._second_frame:
             self.monitors.append(StampMonitor(topic, window, self._second_frame))
         self.configure(parameters)
 
     def configure(self, parameters: Parameters) -> None:
         """Use the time offsets of these parameters."""
-        offsets = (intakes_from(parameters)[self.kind.stream].time_offset, parameters.second_gnss.time_offset)
+        offsets = (time_offset_of(self.kind, parameters), parameters.second_gnss.time_offset)
         self._offsets = [round(offset * SECOND) for offset in offsets]
 
     def read(self, data: bytes, arrival: int) -> Batch:
@@ -84,5 +84,7 @@ class AidInput:
 
 
 def open_inputs(parameters: Parameters, resolve: Callable[[str], str]) -> list[AidInput]:
-    """Every row, in the type that the parameters choose; `resolve` makes the full name of a topic."""
-    return [AidInput(kind, parameters, resolve(getattr(parameters.topics, kind.name))) for kind in INPUTS]
+    """Every row in use, in the type that the parameters choose; `resolve` makes the full name of a topic."""
+    return [
+        AidInput(kind, parameters, resolve(getattr(parameters.topics, kind.name))) for kind in inputs_of(parameters)
+    ]

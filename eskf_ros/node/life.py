@@ -5,6 +5,7 @@ rclpy is imported when it is needed, not above: signals must be caught before it
 
 from __future__ import annotations
 
+import re
 import signal
 from collections.abc import Callable, Sequence
 from types import FrameType
@@ -16,6 +17,14 @@ LONGEST_WAIT = 0.1
 
 class Stopped(BaseException):
     """A signal came while the node was being made; like KeyboardInterrupt no error, so nobody takes it for one."""
+
+
+class StartError(Exception):
+    """The node cannot start with what it was given; the text is one line for the user."""
+
+    def __init__(self, error: Exception) -> None:
+        # Where in the sources of rcl it was found says nothing to the user.
+        super().__init__(re.sub(r",? at /\S+:\d+", "", " ".join(str(error).split())))
 
 
 class StopFlag:
@@ -78,12 +87,17 @@ def run(create_node: Callable[[], Any], stop: StopFlag, arguments: Sequence[str]
     """The life of a process with one node: initialise rclpy, create the node, serve it, take everything down.
 
     `arguments` as of `rclpy.init` (None: those of the process). At the end, and also after an error, the node's
-    `close()` is called while its publishers still work, then its `destroy_node()`.
+    `close()` is called while its publishers still work, then its `destroy_node()`. Raises StartError for arguments
+    that rcl cannot read.
     """
     import rclpy
     from rclpy.signals import SignalHandlerOptions
 
-    rclpy.init(args=None if arguments is None else list(arguments), signal_handler_options=SignalHandlerOptions.NO)
+    words = None if arguments is None else list(arguments)
+    try:
+        rclpy.init(args=words, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:
+        raise StartError(error) from error
     try:
         try:
             stop.raises = not stop.set

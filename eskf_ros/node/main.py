@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from eskf_ros.node.life import StopFlag, run
+from eskf_ros.node.life import StartError, StopFlag, run
 
 USAGE = """\
 usage: eskf_node [--ros-args --params-file FILE -p NAME:=VALUE -r FROM:=TO ...]
@@ -17,7 +17,7 @@ config/eskf.yaml lists every parameter.
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the node until SIGINT or SIGTERM; returns 0, or 2 when a parameter cannot be used."""
+    """Run the node until SIGINT or SIGTERM; returns 0, or 2 when an argument or a parameter cannot be used."""
     words = sys.argv[1:] if arguments is None else list(arguments)
     if words and words[0] in ("-h", "--help"):
         print(USAGE, end="")
@@ -35,16 +35,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     try:
         run(_create, stop, arguments)
-    except ParameterError as error:
+    except (ParameterError, StartError) as error:
         print(f"eskf_node: {error}", file=sys.stderr)
         return 2
     return 0
 
 
 def _create() -> Any:
+    from rclpy.exceptions import ParameterException
+
     from eskf_ros.node.node import EskfNode
 
-    return EskfNode()
+    try:
+        return EskfNode()
+    except (ParameterException, RuntimeError) as error:
+        # rclpy's own parameters, such as those of qos_overrides, and names that cannot be.
+        raise StartError(error) from error
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from geometry_msgs.msg import TwistWithCovarianceStamped
 from sensor_msgs.msg import NavSatFix, NavSatStatus
 
 from eskf_ros.filter.layout import STREAM_NAMES, Verdict
+from eskf_ros.gnss.point_solution import PointSolution, SolutionStatus
 from eskf_ros.simulate.map_frame import MapFrame
 
 SECOND = 1_000_000_000
@@ -49,6 +51,22 @@ def fix_message(row: np.void, datum: tuple[float, float, float], frame: str) -> 
     message.status.status = NavSatStatus.STATUS_FIX
     message.latitude, message.longitude, message.altitude = MapFrame(datum).to_geodetic_deg(row["position_map"])
     message.position_covariance = np.ascontiguousarray(row["pose_covariance"][:3, :3]).ravel()
+    message.position_covariance_type = NavSatFix.COVARIANCE_TYPE_KNOWN
+    return message
+
+
+def solution_message(solution: PointSolution, stamp: int, frame: str) -> NavSatFix:
+    """The position of the antenna by the ranges of one epoch alone, in the frame of the message they came in."""
+    message = NavSatFix()
+    set_header(message.header, stamp, frame)
+    if solution.status != SolutionStatus.SOLVED:
+        message.status.status = NavSatStatus.STATUS_NO_FIX
+        message.latitude = message.longitude = message.altitude = math.nan
+        return message
+    latitude, longitude, message.altitude = map(float, solution.geodetic)
+    message.status.status = NavSatStatus.STATUS_FIX
+    message.latitude, message.longitude = math.degrees(latitude), math.degrees(longitude)
+    message.position_covariance = np.ascontiguousarray(solution.covariance_enu, np.float64).ravel()
     message.position_covariance_type = NavSatFix.COVARIANCE_TYPE_KNOWN
     return message
 

@@ -19,10 +19,12 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
 
-from eskf_ros.filter.layout import Status, Stream, Verdict
+from eskf_ros.compiled import while_compiling
+from eskf_ros.filter.layout import ODOMETRY, STREAM_NAMES, Status, Stream, Verdict, allocate
 from eskf_ros.filter.navigator import Navigator, compile_kernels
 from eskf_ros.filter.warm_start import Memory
-from eskf_ros.inputs import Input
+from eskf_ros.gnss.rinex import RinexError
+from eskf_ros.inputs import Input, uses_ranges
 from eskf_ros.node import robot_localization, transforms
 from eskf_ros.node.cdr import ImuReader, ImuSample, imu_from_message
 from eskf_ros.node.clocks import SECOND, Stamp, StampMonitor
@@ -30,17 +32,21 @@ from eskf_ros.node.declare import LiveParameters, declare, unused_overrides
 from eskf_ros.node.extrinsics import IMU, Extrinsics, place_of
 from eskf_ros.node.inputs import AidInput, open_inputs
 from eskf_ros.node.memory import read_memory, write_memory
-from eskf_ros.node.messages import bias_message, fix_message, record_statuses
+from eskf_ros.node.messages import bias_message, fix_message, record_statuses, solution_message
+from eskf_ros.node.odometry import NUMBERS, fill_odometry
 from eskf_ros.node.outputs import OUTPUT_QOS, OVERRIDING, Outputs
 from eskf_ros.node.poses import set_pose
 from eskf_ros.node.status import status_report
 from eskf_ros.node.trouble import Trouble
-from eskf_ros.parameters import Parameters
+from eskf_ros.parameters import ParameterError, Parameters
+from eskf_ros.ranges.intake import RangeIntake, compile_ranges
 
 INPUT_DEPTH = 1000
 """A second of a fast IMU: what may wait while the computer is busy elsewhere."""
 
 REPORT_PERIOD = 1.0
+PROGRESS_PERIOD = 5.0
+"""Seconds from one report to the next, and from one word about compiling to the next."""
 
 WATCH_EVERY = 10
 """Reports from one look for a second publisher of our transforms to the next."""
@@ -84,10 +90,11 @@ class EskfNode(Node):
         topics = self.parameters.topics
         self.imu_monitor = StampMonitor(self.resolve_topic_name(topics.imu), self.parameters.history.window)
         self.aid_inputs = open_inputs(self.parameters, self.resolve_topic_name)
+        self.range_intake = self._open_ranges()
         self.inputs: list[tuple[Any, Input | None]] = []
         self._subscribe(Imu, topics.imu, input_qos(INPUT_DEPTH), self._on_imu, "imu")
         for source in self.aid_inputs:
-            callback = partial(self._on_aid, source, source.kind.push_of(self.navigator))
+            callback = partial(self._on_aid, source, source.kind.push_of(self.navigator, self.range_intake))
             quality = input_qos(source.kind.depth)
             self._subscribe(source.message_class, source.name, quality, callback, source.kind.name, source.kind)
         # A command is not one of many samples: it must not get lost, and the tools that send it are reliable.
@@ -118,10 +125,23 @@ class EskfNode(Node):
         self._contained(self._write_memory, "warm_start.file")()
 
     def _compile(self) -> None:
-        """Have every kernel compiled before the first message comes: from the cache, or anew for half a minute."""
-        self.get_logger().info("starting the estimator; the first start after an installation compiles it (a minute)")
-        compile_kernels()
-        fix_message(self.navigator.odometry[0], (0.0, 0.0, 0.0), "")
+        """Have every kernel compiled before the first message comes: from the cache, or anew for a minute."""
+        log = self.get_logger().info
+        log("starting the estimator; the first start after an installation compiles it, which takes a minute")
+        started = told = time.monotonic()
+
+        def tell(count: int) -> None:
+            nonlocal told
+            if time.monotonic() - told > PROGRESS_PERIOD:
+                told = time.monotonic()
+                log(f"compiling the estimator: {count} functions in {told - started:.0f} s")
+
+        with while_compiling(tell):
+            compile_kernels()
+            if uses_ranges(self.parameters):
+                compile_ranges(self.parameters)
+            fill_odometry(allocate(ODOMETRY), 0, False, np.zeros((2, NUMBERS)))
+            fix_message(self.navigator.odometry[0], (0.0, 0.0, 0.0), "")
 
     def _publisher(self, kind: Any, topic: str) -> Any:
         return self.create_publisher(kind, topic, OUTPUT_QOS, qos_overriding_options=OVERRIDING)
@@ -213,7 +233,17 @@ class EskfNode(Node):
         if took > self.longest_callback:
             self.longest_callback = took
 
-    def _on_aid(self, source: AidInput, push: Callable[..., None], data: bytes) -> None:
+    def _open_ranges(self) -> RangeIntake | None:
+        """Make ready for ranges, if GNSS is used by them."""
+        if not uses_ranges(self.parameters):
+            return None
+        self._solutions = self._publisher(NavSatFix, "gnss/point_solution")
+        try:
+            return RangeIntake(self.navigator, self.parameters)
+        except RinexError as error:
+            raise ParameterError("ranges.rinex_nav_files", [str(error)]) from error
+
+    def _on_aid(self, source: AidInput, push: Callable[..., Any], data: bytes) -> None:
         arrival = self.now()
         batch = source.read(data, arrival)
         frame = batch.strings[int(batch.messages["frame_id"][0])]
@@ -222,10 +252,14 @@ class EskfNode(Node):
             place = place_of(source.kind.name, receiver)
             self._meet_frame(self._frames_met, (source.kind.name, frame), place, frame)
         stamp = int(batch.messages["stamp"][0])
-        if source.monitors[receiver].note(stamp and stamp + source.offset(receiver), arrival) == Stamp.ZERO:
-            return
+        if source.kind.is_timed:
+            moved = stamp and stamp + source.offset(receiver)
+            if source.monitors[receiver].note(moved, arrival) == Stamp.ZERO:
+                return
         for arguments in source.arguments(batch):
-            push(*arguments)
+            solution = push(*arguments)
+            if solution is not None:
+                self._solutions.publish(solution_message(solution, stamp, frame))
             self._is_judging = True
 
     def _tell_verdicts(self) -> None:
@@ -251,6 +285,9 @@ class EskfNode(Node):
         self.latest_fixes = fixes or self.latest_fixes
         stamp = self.get_clock().now().to_msg()
         refused = records[records["verdict"] == Verdict.OUTSIDE_HISTORY]
+        for stream in np.unique(refused["stream"]).tolist():
+            window = self.parameters.history.window
+            self.trouble.note(f"{STREAM_NAMES[stream]}: a message came too late for history.window = {window:g} s")
         if len(refused):
             self._aids.publish(record_statuses(refused, stamp))
         row, datum = self.navigator.odometry[0], self.navigator.datum
@@ -264,6 +301,8 @@ class EskfNode(Node):
             self.get_logger().warn("the alignment began again: the IMU was silent, or fix after fix was rejected")
         self._restarts = self.navigator.restarts
         self._diagnostics.publish(status_report(self, stamp))
+        if self.range_intake is not None:
+            self.range_intake.wants_solution = self._solutions.get_subscription_count() > 0
         self.callbacks, self.callback_time, self.longest_callback = 0, 0.0, 0.0
         self._watch_transforms()
         self._reports += 1
@@ -326,7 +365,7 @@ class EskfNode(Node):
     def _on_static_transforms(self, message: Any) -> None:
         for transform in message.transforms:
             self.extrinsics.note_transform(transform)
-        self._complete_extrinsics()
+        self._complete_extrinsics(is_late=True)
 
     def _meet_frame(self, met: set[Any], key: object, place: str, frame: str) -> None:
         """Take note of a frame name that an input has not used before."""
@@ -334,16 +373,17 @@ class EskfNode(Node):
             return
         met.add(key)
         if place:
-            self.extrinsics.note_frame(place, frame)
-            self._complete_extrinsics()
+            is_first = self.extrinsics.note_frame(place, frame)
+            self._complete_extrinsics(is_late=not is_first)
 
-    def _complete_extrinsics(self) -> None:
+    def _complete_extrinsics(self, is_late: bool) -> None:
+        """Use the places that can be found now; start again if earlier messages were taken for those of elsewhere."""
         found = self.extrinsics.find()
         for line in found:
             self.get_logger().info(line)
         if found:
             self._configure(self._live.current)
-            if self.navigator.status > Status.LEVELLING:
+            if is_late and self.navigator.status > Status.LEVELLING:
                 self._reset("the place of a sensor has become known")
 
     def _read_memory(self) -> Memory | None:

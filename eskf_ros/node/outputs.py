@@ -11,7 +11,6 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from eskf_ros.filter.layout import ODOMETRY, allocate
 from eskf_ros.node import transforms
 from eskf_ros.node.cdr import AnyOdometryWriter, LayoutError, OdometryMessageWriter, OdometryWriter
 from eskf_ros.node.odometry import GLOBAL, LOCAL, NUMBERS, fill_odometry
@@ -38,7 +37,6 @@ class Outputs:
         self._divisor = parameters.output.rate_divisor
         self._rows = 0
         self._numbers = np.zeros((2, NUMBERS))
-        fill_odometry(allocate(ODOMETRY), 0, self._two_d, self._numbers)  # compiles it
         self.published = 0
         frames = parameters.frames
         self._global_writer = self._writer(frames.map, frames.base_link)

@@ -35,7 +35,8 @@ def status_report(node: EskfNode, stamp: Time) -> DiagnosticArray:
     if is_silent and status != Status.FAULT:
         # Whatever the estimate was worth: nothing is published without the IMU.
         status = Status.WAITING_IMU
-    problems = [*node.navigator.complaints, *clock_complaints(node.monitors, now)]
+    ranges = [] if node.range_intake is None else node.range_intake.complaints
+    problems = [*node.navigator.complaints, *ranges, *clock_complaints(node.monitors, now)]
     problems += [*mismatches(node), *second_publishers(node), *node.trouble.problems()]
     waiting = waiting_for(node, status, row, now)
     level = DiagnosticStatus.OK if status == Status.GOOD and not problems else DiagnosticStatus.WARN
@@ -57,7 +58,7 @@ def status_report(node: EskfNode, stamp: Time) -> DiagnosticArray:
 
 def waiting_for(node: EskfNode, status: Status, row: np.void, now: int) -> list[str]:
     """What keeps the state from the next rung."""
-    fixes = next(source for source in node.aid_inputs if source.kind.stream == Stream.GNSS_POSITION).monitors
+    fixes = next(source for source in node.aid_inputs if source.kind.name in ("gnss_fix", "ranges")).monitors
     if status in (Status.WAITING_IMU, Status.LEVELLING):
         return missing(node, [node.imu_monitor], now) or ["standing still or driving steadily for a moment"]
     if status == Status.FAULT:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,19 +12,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.gnss.cloud import CloudError, Epoch, read_epoch
+from eskf_ros.gnss.cloud import CloudError, Epoch, read_epoch, write_epoch
 from eskf_ros.gnss.ephemeris import Ephemerides
 from eskf_ros.gnss.ephemeris_cloud import read_ephemerides
 from eskf_ros.gnss.measurements import Masks, measured_epoch
 from eskf_ros.gnss.point_solution import PointSettings, PointSolution, SolutionStatus, solve
 from eskf_ros.gnss.range_files import read_navigation_files
-from eskf_ros.gnss.range_model import NO_KLOBUCHAR
-from eskf_ros.gnss.ranges import Status, locate, one_per_satellite
+from eskf_ros.gnss.ranges import (
+    CODE_VALID,
+    DOPPLER_VALID,
+    SATELLITE_KNOWN,
+    Status,
+    allocate_ranges,
+    locate,
+    one_per_satellite,
+)
 from eskf_ros.gnss.signals import Gnss
 from eskf_ros.parameters import Parameters
 
 HORIZON = math.radians(-90.0)
 """No elevation mask: where the receiver is, only the filter knows."""
+
+DEFAULT_KLOBUCHAR = np.array(
+    [0.1118e-07, -0.7451e-08, -0.5961e-07, 0.1192e-06, 0.1167e06, -0.2294e06, -0.1311e06, 0.1049e07]
+)
+"""Broadcast on 1 January 2004, a year of middling solar activity: stands in where no parameters came (as in RTKLIB).
+
+Zeros would leave the whole delay, metres that differ from satellite to satellite.
+"""
 
 COVARIANCE_KNOWN = 3
 STATUS_FIX = 0
@@ -49,8 +65,9 @@ class RangeIntake:
 
     Attributes:
         epochs: epochs that were read.
-        solved: epochs of which a point solution was made (mode loose with ``ranges.use_point_solution``).
+        solved: epochs of which a point solution was made.
         refused: messages that could not be read, by reason.
+        wants_solution: make a point solution of every epoch, in mode tight too.
     """
 
     def __init__(self, navigator: Navigator, parameters: Parameters) -> None:
@@ -64,11 +81,12 @@ class RangeIntake:
         self._time_offset = parameters.ranges.time_offset
         files = read_navigation_files([Path(name) for name in parameters.ranges.rinex_nav_files.split(":") if name])
         self._ephemerides = Ephemerides(files.records)
-        self._klobuchar = files.klobuchar.get(Gnss.GPS, NO_KLOBUCHAR)
+        self._klobuchar = files.klobuchar.get(Gnss.GPS, DEFAULT_KLOBUCHAR)
         self._last: NDArray[np.float64] | None = None
         self.epochs = 0
         self.solved = 0
         self.refused: Counter[str] = Counter()
+        self.wants_solution = False
 
     def take_ephemerides(self, stamp: int, points: NDArray[Any], arrival: int = 0) -> None:
         """Add the points of a message of `gnss/ephemerides`; they serve the ranges that come after them."""
@@ -97,22 +115,28 @@ class RangeIntake:
             self.refused["ranges: signals beyond the first 200 of an epoch"] += epoch.left_out
         self.epochs += 1
         if self._solves:
-            return self._push_solution(stamp, epoch, arrival)
+            solution = self._solution(epoch)
+            self._navigator.range_statuses.update(Status(status) for status in epoch.ranges["status"].tolist())
+            self._push_solution(stamp + round(self._time_offset * 1e9), solution, arrival)
+            return solution
         instant = (epoch.week, epoch.seconds)
         signals = measured_epoch(epoch.ranges, *instant, self._ephemerides, masks=self._masks)
         self._navigator.push_ranges(stamp, instant, signals, self._klobuchar, arrival)
-        return None
+        return self._solution(epoch) if self.wants_solution else None
 
-    def _push_solution(self, stamp: int, epoch: Epoch, arrival: int) -> PointSolution:
-        """Give position and velocity of the epoch alone to the navigator, as a receiver would."""
+    def _solution(self, epoch: Epoch) -> PointSolution:
+        """Solve the epoch alone, as a receiver would."""
         locate(epoch.ranges, epoch.week, epoch.seconds, self._ephemerides)
-        self._navigator.range_statuses.update(Status(status) for status in epoch.ranges["status"].tolist())
         ranges, klobuchar = one_per_satellite(epoch.ranges), self._klobuchar
         solution = solve(ranges, epoch.week, epoch.seconds, klobuchar, self._point_settings, self._last)
-        stamp += round(self._time_offset * 1e9)
         if solution.status == SolutionStatus.SOLVED:
             self.solved += 1
             self._last = solution.position_ecef
+        return solution
+
+    def _push_solution(self, stamp: int, solution: PointSolution, arrival: int) -> None:
+        """Give position and velocity of a point solution to the navigator."""
+        if solution.status == SolutionStatus.SOLVED:
             latitude, longitude, altitude = solution.geodetic
             self._navigator.push_gnss_position(
                 stamp,
@@ -127,12 +151,15 @@ class RangeIntake:
         if solution.velocity_status == SolutionStatus.SOLVED:
             covariance = solution.velocity_covariance_enu.ravel()
             self._navigator.push_gnss_velocity(stamp, solution.velocity_enu.tolist(), covariance, arrival)
-        return solution
 
     @property
     def complaints(self) -> list[str]:
         """What is wrong with the messages, one sentence each with what to do; empty when nothing is."""
         found = [f"{count} times: {reason}" for reason, count in self.refused.items()]
+        if self.epochs and self._klobuchar is DEFAULT_KLOBUCHAR:
+            found.append(
+                "no parameters of the ionosphere came with the ephemerides: those of a middling day stand in for them"
+            )
         statuses = self._navigator.range_statuses
         total = sum(statuses.values()) - statuses[Status.OTHER_SIGNAL]
         for status, count in statuses.items():
@@ -143,3 +170,19 @@ class RangeIntake:
                     + (f": {remedy}" * bool(remedy))
                 )
         return found
+
+
+def compile_ranges(parameters: Parameters) -> None:
+    """Compile all that a `RangeIntake` calls, or load it from the cache, with an epoch of five satellites."""
+    parameters = replace(parameters, ranges=replace(parameters.ranges, rinex_nav_files=""))
+    trial = RangeIntake(Navigator(parameters), parameters)
+    trial.wants_solution = True
+    antenna = np.array([6.378e6, 0.0, 0.0])
+    ranges = allocate_ranges(5)
+    ranges["sv_id"], ranges["signal"] = np.arange(1, 6), 0
+    ranges["satellite"] = antenna + 2e7 * np.array([(1, 0, 0), (1, 1, 0), (1, -1, 0), (1, 0, 1), (1, 0, -1)])
+    ranges["pseudorange"] = np.linalg.norm(ranges["satellite"] - antenna, axis=1)
+    for name in ("satellite_velocity", "satellite_clock", "satellite_clock_drift", "doppler"):
+        ranges[name] = 0.0
+    ranges["flags"] = CODE_VALID | DOPPLER_VALID | SATELLITE_KNOWN
+    trial.take_ranges(1_000_000_000, write_epoch(ranges, 2200, 0.0, satellites=True))

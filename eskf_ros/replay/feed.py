@@ -77,6 +77,8 @@ class Feed:
             nonlocal done
             while imu is not None and done < end:
                 part = slice(done, min(end, done + LARGEST_PUSH))
+                orientation = imu.messages["orientation"][part], imu.messages["orientation_covariance"][part]
+                self._navigator.push_imu_orientation(stamps[part], *orientation)
                 rows.append(self._navigator.push_imu(stamps[part], specific_force[part], angular_rate[part]))
                 done = part.stop
 

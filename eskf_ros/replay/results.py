@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
+from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import TracebackType
@@ -17,16 +18,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.bags import BagWriter, message_dtype
-from eskf_ros.filter.layout import STREAM_NAMES, Verdict
+from eskf_ros.filter.aiding.signal import name_of
+from eskf_ros.filter.layout import STREAM_NAMES, Stream, Verdict
 from eskf_ros.parameters import Frames
 from eskf_ros.replay.digits import tum_text
 from eskf_ros.replay.topics import FIX, ODOMETRY
 from eskf_ros.simulate.map_frame import MapFrame, to_geodetic
 
 NAMES = ("odometry.mcap", "trajectory.tum", "aids.csv", "summary.json")
-AIDS_HEADER = "stamp,arrival,aid,innovation_0,innovation_1,innovation_2,nis,dof,verdict\n"
+AIDS_HEADER = "stamp,arrival,aid,innovation_0,innovation_1,innovation_2,nis,dof,verdict,source\n"
 FIX_INTERVAL = 1_000_000_000
 """ns between two NavSatFix messages in odometry.mcap."""
+
+RANGE_STREAMS = (Stream.PSEUDORANGE, Stream.RANGE_RATE)
+_signal_name = lru_cache(maxsize=1024)(name_of)
 
 VERDICT_NAMES = tuple(verdict.name.lower() for verdict in Verdict)
 
@@ -138,13 +143,20 @@ def _first_in_each(stamps: NDArray[np.int64], last: int, interval: int) -> NDArr
 
 
 def aids_lines(records: NDArray[Any]) -> str:
-    """Lines of aids.csv; stamps in seconds with nine decimals, numbers with all digits, nan where there is none."""
+    """Lines of aids.csv; stamps in seconds with nine decimals, numbers with all digits, nan where there is none.
+
+    The source is the signal of a range, else the number of the receiver.
+    """
     stamp, arrival = np.divmod(records["stamp"], 1_000_000_000), np.divmod(records["arrival"], 1_000_000_000)
     columns = [column.tolist() for column in (*stamp, *arrival)]
     columns.append([STREAM_NAMES[stream] for stream in records["stream"].tolist()])
     columns += [column.tolist() for column in (*records["innovation"].T, records["nis"], records["dof"])]
     columns.append([VERDICT_NAMES[verdict] for verdict in records["verdict"].tolist()])
-    line = "%d.%09d,%d.%09d,%s,%r,%r,%r,%r,%d,%s\n"
+    is_range = np.isin(records["stream"], RANGE_STREAMS).tolist()
+    columns.append(
+        [_signal_name(source) if named else source for source, named in zip(records["source"].tolist(), is_range)]
+    )
+    line = "%d.%09d,%d.%09d,%s,%r,%r,%r,%r,%d,%s,%s\n"
     return "".join(map(line.__mod__, zip(*columns, strict=True)))
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from eskf_ros.bags import BagReader, Batch
 from eskf_ros.filter.layout import Stream
-from eskf_ros.inputs import FIX, FIXES, INPUTS, ODOMETRY, RANGES, TWIST, Input
+from eskf_ros.inputs import FIX, ODOMETRY, RANGES, TWIST, Input, inputs_of, uses_ranges
 from eskf_ros.parameters import Parameters, Topics
 from eskf_ros.replay.truth import epochs_from_fix, epochs_from_odometry
 from eskf_ros.simulate.map_frame import MapFrame
@@ -60,13 +60,9 @@ def find_topics(
     """
     names = parameters.topics
     imu = _require(reader, bag, names.imu, (IMU,), "set topics.imu in --config FILE")
-    uses_ranges = parameters.mode == "tight" or parameters.ranges.use_point_solution
-    unused = FIXES if uses_ranges else RANGES
     inputs = {}
-    for kind in INPUTS:
+    for kind in inputs_of(parameters):
         name, remedy = getattr(names, kind.name), f"set topics.{kind.name} in --config FILE"
-        if kind.name in unused:
-            continue
         if kind.name in RANGES and has_range_file:
             inputs[kind] = name
             continue
@@ -75,7 +71,7 @@ def find_topics(
             instead = " (a RINEX file can be given with --ranges FILE.obs)" if kind.name == "ranges" else ""
             topic = _require(reader, bag, name, kind.types, remedy, instead)
             inputs[kind.of_type(reader.topics[topic].type)] = topic
-    has_velocity = uses_ranges or any(kind.stream == Stream.GNSS_VELOCITY for kind in inputs)
+    has_velocity = uses_ranges(parameters) or any(kind.stream == Stream.GNSS_VELOCITY for kind in inputs)
     hints = [] if has_velocity else _velocity_hint(reader, names, inputs)
     beside = frozenset(inputs[kind] for kind in inputs if kind.name in RANGES) if has_range_file else frozenset()
     if not truth:

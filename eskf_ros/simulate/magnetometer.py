@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +52,13 @@ class Magnetometer:
         level = math.cos(inclination)
         direction = (level * math.sin(declination), level * math.cos(declination), -math.sin(inclination))
         return self.strength * np.array(direction)
+
+    def parameters(self) -> dict[str, Any]:
+        """Return the estimator's parameters that describe this sensor, by dotted name; its use is not asked for."""
+        return {
+            "mag.mount_rpy_deg": list(self.rpy_deg),
+            "mag.std_floor": max(self.noise_std, 1e-9),
+        }
 
     def measure(
         self, section: Section, episodes: Sequence[Episode], seed: np.random.SeedSequence

@@ -172,7 +172,7 @@ class Recording(GnssMeasurements):
 
     def parameters(self) -> dict[str, Any]:
         """Return the estimator's parameters that describe the sensors of this recording, by dotted name."""
-        described = (self.options.dual_antenna, self.options.barometer)
+        described = (self.options.dual_antenna, self.options.barometer, self.options.magnetometer)
         return {
             **grade_parameters(self.options.grade),
             "imu.mount_position": list(self.options.imu_position),

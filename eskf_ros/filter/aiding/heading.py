@@ -5,7 +5,8 @@ place where it is, and their covariance (rad2) in the first two axes; either may
 East-North-Up, yaw = atan2(d_n, d_e) and pitch = atan2(-d_u, |d_e, d_n|); a small rotation theta about local axes adds
 theta x d to d.
 
-The line of source 1 is the x axis of base_link: what an IMU with a filter of its own says of it (``heading_hints``).
+The line of source 1 is the x axis of base_link: what an IMU with a filter of its own says of it, perhaps from magnetic
+north. It serves at start only (``heading_hints``).
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from eskf_ros.compiled import njit
 from eskf_ros.filter.aiding.common import azimuth_change, clear, set_attitude_row, to_local
 from eskf_ros.filter.aiding.gnss_velocity import local_east_north_up_to_ecef
 from eskf_ros.rotation import wrapped
+
+IMU_ORIENTATION = 1
 
 STEEPEST = 0.17
 """Cosine of the steepest pitch (80 degrees) at which a line still has a heading."""
@@ -33,6 +36,11 @@ def predict(state, source, settings):
 def linearize(state, payload, source, settings, work):
     """Write innovation, Jacobian and noise of what was measured of yaw and pitch to ``work``; return the size."""
     clear(work)
+    yaw = payload[0]
+    if source == IMU_ORIENTATION and settings.is_orientation_magnetic == 1:
+        if state.field_known == 0:
+            return 0
+        yaw -= state.field_declination
     line = settings.heading_lines_body[source]
     local_to_ecef = local_east_north_up_to_ecef(state)
     d = to_local(state, local_to_ecef, (line[0], line[1], line[2]))
@@ -42,7 +50,7 @@ def linearize(state, payload, source, settings, work):
     level = math.sqrt(level_square)
     size = 0
     if payload[3] > 0.0:
-        work.innovation[0] = wrapped(payload[0] - math.atan2(d[1], d[0]))
+        work.innovation[0] = wrapped(yaw - math.atan2(d[1], d[0]))
         set_attitude_row(work.jacobian, 0, state, local_to_ecef, azimuth_change(d, level_square))
         work.noise[0, 0] = payload[3]
         size = 1

@@ -4,6 +4,10 @@
 
 (Groves, section 9.4.1, satellite clock taken out). Jacobian: minus the line of sight u for the position, u x lever for
 the attitude on the map side, one for clock bias and offset. The atmosphere is that of the current position.
+
+What lasts in the errors of all ranges together (reflections, orbits, atmosphere) may be an optional state: it moves the
+antenna that the satellites see by a standard deviation times a state of unit variance per axis (first-order
+Gauss-Markov).
 """
 
 from __future__ import annotations
@@ -86,7 +90,12 @@ def predict(state, payload, source, settings):
     place = offset_place(system_of(source), settings)
     if place < state.error_size:
         pseudorange += state.optional[place - ERROR_SIZE]
-    return pseudorange, to_map(state, unit), elevation, ionosphere
+    unit = to_map(state, unit)
+    place = settings.position_error_at
+    if place < state.error_size:
+        for i in range(3):
+            pseudorange -= unit[i] * settings.range_error_std * state.optional[place - ERROR_SIZE + i]
+    return pseudorange, unit, elevation, ionosphere
 
 
 @njit
@@ -125,4 +134,8 @@ def linearize(state, payload, source, settings, work):
     place = offset_place(system_of(source), settings)
     if place < state.error_size:
         work.jacobian[0, place] = 1.0
+    place = settings.position_error_at
+    if place < state.error_size:
+        for i in range(3):
+            work.jacobian[0, place + i] = -unit[i] * settings.range_error_std
     return SIZE

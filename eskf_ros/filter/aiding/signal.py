@@ -13,7 +13,7 @@ from eskf_ros.filter.aiding.gnss_velocity import body_rate
 from eskf_ros.filter.layout import ERROR_SIZE
 from eskf_ros.gnss.geometry import line_of_sight
 from eskf_ros.gnss.ranges import ALREADY_TURNED
-from eskf_ros.gnss.signals import time_group
+from eskf_ros.gnss.signals import LETTERS, SIGNALS, time_group
 from eskf_ros.rotation import cross, rotate, rotate_back, to_matrix
 
 MEASURED = 0
@@ -27,6 +27,8 @@ NOISE_FACTOR = 11
 GPS_TIME = 12
 KLOBUCHAR = 13
 
+LETTER_OF = {int(gnss): letter for letter, gnss in LETTERS.items()}
+
 
 @njit
 def source_of(gnss_id, sv_id, signal):
@@ -38,6 +40,14 @@ def source_of(gnss_id, sv_id, signal):
 def satellite_of(source):
     """Return ``gnss_id`` and ``sv_id`` of a source."""
     return source >> 16, (source >> 8) & 255
+
+
+def name_of(source: int) -> str:
+    """Return the name of a signal as RINEX has it: constellation and satellite, band and attribute ("G07 1C")."""
+    gnss_id, sv_id, signal = source >> 16, (source >> 8) & 255, source & 255
+    letter = LETTER_OF.get(gnss_id, "?")
+    code = SIGNALS[signal].code if signal < len(SIGNALS) else "?"
+    return f"{letter}{sv_id:02d} {code}"
 
 
 @njit
