@@ -274,6 +274,28 @@ STATE = np.dtype(
         ("absolute_interval", "i8"),
         ("rejected_fixes", "i8"),
         ("restarts", "i8"),
+        # Monitors of the GNSS receivers (see ``aid_monitors``): effect of faults on the state so far, normal equations;
+        # sums of innovations up and down on two axes; counts, means, sums.
+        ("fault_stamp", "i8"),
+        ("fault_force", "f8", (3,)),
+        ("fault_absorbed", "f8", (SOURCES, ERROR_SIZE, 4)),
+        ("fault_information", "f8", (SOURCES, 4, 4)),
+        ("fault_evidence", "f8", (SOURCES, 4)),
+        ("drift_sums", "f8", (SOURCES, 4)),
+        ("departures", "i8", (SOURCES,)),
+        ("departure_stamp", "i8", (SOURCES,)),
+        ("seen_stamp", "i8", (SOURCES,)),
+        ("fix_count", "i8", (SOURCES,)),
+        ("scattered_fixes", "i8", (SOURCES,)),
+        ("scatter_sum", "f8", (SOURCES,)),
+        ("contradicted_fixes", "i8", (SOURCES,)),
+        ("contradiction_rate", "f8", (SOURCES,)),
+        ("velocity_nis", "f8", (SOURCES, 2)),
+        ("coasts", "i8"),
+        ("coast_nis", "f8"),
+        ("heading_mark_stamp", "i8"),
+        ("heading_mark_std", "f8"),
+        ("heading_stuck", "i8"),
         # The Earth's magnetic field where the last good fix was (rad, rad, T; strength 0: unknown), whether it is
         # known, when it was last found disturbed; heading and place since which its error is another.
         ("field_declination", "f8"),
@@ -296,7 +318,7 @@ STATE = np.dtype(
         ("aid_fused_since", "i8", (SENSOR_STREAMS, SOURCES)),
         ("aid_rejected", "i8", (SENSOR_STREAMS, SOURCES)),
         # The track of the fixes by receiver: where they are (m) and move (m/s) beside the reckoned position, which
-        # is the position without any correction, and variances per axis; misses and rejected members.
+        # is the position without any correction, and variances per axis; misses and rejected members, jumps (m).
         ("corrections_map", "f8", (3,)),
         ("track_stamp", "i8", (SOURCES,)),
         ("track_offset", "f8", (SOURCES, 3)),
@@ -305,6 +327,9 @@ STATE = np.dtype(
         ("track_mixed_variance", "f8", (SOURCES, 3)),
         ("track_rate_variance", "f8", (SOURCES, 3)),
         ("track_misses", "i8", (SOURCES,)),
+        ("track_hit_stamp", "i8", (SOURCES,)),
+        ("track_jumps", "i8", (SOURCES,)),
+        ("track_jump", "f8", (SOURCES,)),
         ("track_rejected", "i8", (SOURCES,)),
         ("track_rejected_since", "i8", (SOURCES,)),
         ("scatter", "f8", (SOURCES,)),
@@ -405,6 +430,7 @@ SETTINGS = np.dtype(
         ("imu_to_base", "f8", (3, 3)),
         ("imu_position_base", "f8", (3,)),
         ("lever_arms_body", "f8", (SOURCES, 3)),
+        ("gnss_time_offset", "f8", (SOURCES,)),
         ("heading_lines_body", "f8", (SOURCES, 3)),
         ("baro_arm_body", "f8", (3,)),
         ("mag_to_imu", "f8", (3, 3)),
@@ -490,6 +516,7 @@ WORK = np.dtype(
         ("jacobian", "f8", (3, ERROR_CAPACITY)),
         ("innovation", "f8", (3,)),
         ("noise", "f8", (3, 3)),
+        ("effect", "f8", (3, 4)),
         ("projected", "f8", (3, ERROR_CAPACITY)),
         ("innovation_covariance", "f8", (3, 3)),
         ("gain", "f8", (ERROR_CAPACITY, 3)),
@@ -553,13 +580,14 @@ def allocate(dtype: np.dtype, count: int = 1) -> np.ndarray:
 
 _EVIDENCE = ("still_stamp", "motion_stamp", "last_fix_stamp", "anchor_stamp", "block_end", "wheel_stamp", "slip_stamp")
 _RECOVERY = ("aid_stamp", "aid_fused_stamp", "aid_fused_since", "track_stamp", "reset_stamp")
+_MONITORS = ("fault_stamp", "departure_stamp", "seen_stamp", "heading_mark_stamp")
 
 
 def blank_state() -> np.ndarray:
     """Return the state before the first IMU sample."""
     state = allocate(STATE)
     stamps = ("stamp", "imu_stamp", "first_stamp", "window_start", "absolute_stamp", "disturbed_stamp")
-    for field in (*stamps, *_EVIDENCE, *_RECOVERY):
+    for field in (*stamps, *_EVIDENCE, *_RECOVERY, *_MONITORS):
         state[field] = NEVER
     state["scatter"] = state["scatter_paid"] = 1.0
     state["attitude"][0, 0] = 1.0

@@ -179,10 +179,4 @@ def complaints(state: np.void) -> list[str]:
         found.append(
             f"the gyro reads more than {FASTEST_TURN:.0f} rad/s for seconds: is it in deg/s? REP-103 wants rad/s"
         )
-    resets = int(state["resets"])
-    if resets:
-        found.append(
-            f"{resets} times fixes that agree with each other contradicted the filter for so long that position and "
-            "velocity were reset to them: IMU noise parameters too small, or multipath for many seconds"
-        )
     return found + _heading_complaints(state)

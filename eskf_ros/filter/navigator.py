@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
+from eskf_ros.filter.aid_monitors import aid_complaints, watch_aid
 from eskf_ros.filter.aiding import baro, gnss_position, gnss_velocity, heading, mag, nhc, wheel
 from eskf_ros.filter.alignment import (
     heading_of,
@@ -218,11 +219,10 @@ def fuse(state, aids, i, settings, work):
     if aid.stream == HEADING and aid.source == heading.IMU_ORIENTATION and state.heading_known == 1:
         aid.verdict = INACTIVE
         return
+    if state.position_known == 0 and aid.stream == GNSS_POSITION:
+        begin(state, aid, settings)
     position = (state.position_map[0], state.position_map[1], state.position_map[2])
     heading_before = heading_of(state, settings)
-    if state.position_known == 0 and aid.stream == GNSS_POSITION:
-        start_position(state, aid.payload)
-        recall_heading(state, aid.payload, settings)
     join(state, settings.reach[aid.stream], settings)
     watch_solution(state, aid, settings)
     if aid.stream == MAG:
@@ -250,12 +250,23 @@ def fuse(state, aids, i, settings, work):
     gate = gate_of(state, aid, size, settings)
     aid.verdict, aid.nis = update(state, size, gate, work)
     recover(state, aid, size, gate, settings, work)
+    watch_aid(state, aid, size, gate, work, settings)
     if aid.verdict == FUSED and state.heading_known == 0:
         search_heading(state, aid, gate, settings, work)
     if aid.stream == GNSS_POSITION:
         mag.note_field(state, aid)
     elif aid.stream == WHEEL:
         watch_wheels(state, aid)
+    note_jump(state, position, heading_before, settings)
+
+
+@njit
+def begin(state, aid, settings):
+    """Take the position from the first fix, and the heading from memory if the robot is where it was left."""
+    position = (state.position_map[0], state.position_map[1], state.position_map[2])
+    heading_before = heading_of(state, settings)
+    start_position(state, aid.payload)
+    recall_heading(state, aid.payload, settings)
     note_jump(state, position, heading_before, settings)
 
 
@@ -684,7 +695,7 @@ class Navigator:
     @property
     def complaints(self) -> list[str]:
         """What is wrong with whole streams, one sentence each with what to do; empty when nothing is."""
-        found = complaints(self._states[0])
+        found = complaints(self._states[0]) + aid_complaints(self._states[0], self._settings[0])
         if self._field_problem:
             found.append(self._field_problem)
         for stream, difference in self._stamp_difference.items():

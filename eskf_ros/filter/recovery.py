@@ -65,8 +65,12 @@ INERTIAL_SIGMAS = 5.0
 
 LAST_RESORT = 60_000_000_000
 RESETS = 3
-"""The alignment starts again when fixes have come in vain for so long, or after so many resets each within this time
-of the one before."""
+RESET_HELPS = 20_000_000_000
+"""The alignment starts again when fixes have come in vain for so long (ns), or after so many resets, none of which
+helped for so long."""
+
+RESTART_HELPS = 300_000_000_000
+"""If after a new alignment, within this time (ns), resets do not help either, alignment is not what is wrong."""
 
 NEAR_GATE = 4.0
 """Up to so many times the gate (twice the innovation) a filter may be too sure of itself; beyond, the fix is wrong."""
@@ -252,7 +256,7 @@ def reset(state, source, settings, work):
                 covariance[v, p] = state.track_mixed_variance[source, i]
     if settings.position_error_at < state.error_size:
         renew(state, settings.position_error_at, 3, settings)
-    is_recent = state.reset_stamp != NEVER and state.stamp - state.reset_stamp < LAST_RESORT
+    is_recent = state.reset_stamp != NEVER and state.stamp - state.reset_stamp < RESET_HELPS
     state.recent_resets = state.recent_resets + 1 if is_recent else 1
     state.reset_stamp = state.stamp
     state.resets += 1
@@ -269,9 +273,10 @@ def forget_error(covariance, place):
 
 @njit
 def is_lost(state):
-    """Say whether only a new alignment is left: nothing is accepted for long, neither fixes nor velocities."""
+    """Say whether only a new alignment is left: resets do not help, or neither fixes nor velocities are accepted."""
+    is_new = state.restarts > 0 and state.stamp - state.first_stamp < RESTART_HELPS
     if state.recent_resets >= RESETS:
-        return True
+        return not is_new
     since = max(state.absolute_stamp, state.first_stamp)
     for source in range(SOURCES):
         since = max(since, state.aid_fused_stamp[GNSS_VELOCITY, source])

@@ -169,6 +169,7 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
     settings["imu_to_base"] = imu_to_base
     settings["imu_position_base"] = imu.mount_position
     lever_arms_base = np.subtract([parameters.gnss.lever_arm, parameters.second_gnss.lever_arm], imu.mount_position)
+    settings["gnss_time_offset"] = (parameters.gnss.time_offset, parameters.second_gnss.time_offset)
     settings["lever_arms_body"] = lever_arms_base @ imu_to_base
     baseline = _matrix(parameters.heading.mount_rpy_deg)[:, 0]
     settings["heading_lines_body"] = np.array([baseline, (1.0, 0.0, 0.0)]) @ imu_to_base

@@ -9,6 +9,8 @@ the offset. Fixes that do not follow the others are misses, and after a few of t
 
 from __future__ import annotations
 
+import math
+
 from eskf_ros.compiled import njit
 from eskf_ros.filter.aiding.gnss_position import noise_factor
 from eskf_ros.filter.layout import NEVER, POSITION, SOURCES, Stream
@@ -21,18 +23,31 @@ LONGEST_PATIENCE = 30_000_000_000
 MISSED_INTERVALS = 2.5
 """An aid is silent when so many of its usual intervals pass, within these limits (ns)."""
 
+LONGEST_LEAD = 2_000_000_000
+"""A velocity says nothing of what was or will be so long (ns) before or after it."""
+
 MISSES = 3
 MISS_GATE = 16.27
 """A fix further (squared, in its standard deviations; 3 axes, 0.999) from the track is a miss; the track starts anew
 after so many in a row."""
 
+UNBROKEN = 5_000_000_000
+"""Without a fix that belongs to the track for longer (ns) the reckoned position may have drifted away."""
+
+LEAST_JUMP = 2.0
+"""A step (m) that deserves the name."""
+
 UNKNOWN_RATE_STD = 10.0
 RATE_NOISE_DENSITY = 0.05
-"""Rate of a new track (m/s), and how fast it may change (m/s2/rtHz): the track forgets within some seconds."""
+INERTIAL_NOISE_DENSITY = 0.2
+"""Rate of a new track (m/s), and how fast it may change (m/s2/rtHz), led by velocities or by the IMU alone: the track
+forgets within some seconds."""
 
 SCATTER_GAIN = 0.08
 SCATTER_CLIP = 4.0
-"""Share of the newest fix in the measure of scatter, and the most that it may add, in measures."""
+SCATTER_SHARE = 10.0
+"""Share of the newest fix in the measure of scatter, and the most that it may add, in measures; variance of the track,
+in that of a fix, from which on it says nothing."""
 
 SCATTER_GROWTH = 4.0
 """A step aside and back does not make the scatter seem so large."""
@@ -64,6 +79,13 @@ def is_fusing(state, stream, source):
 
 
 @njit
+def is_led(state, source):
+    """Say whether velocities of a receiver come often enough to lead the track of its fixes."""
+    last = state.aid_stamp[GNSS_VELOCITY, source]
+    return last != NEVER and state.stamp - last <= LONGEST_LEAD
+
+
+@njit
 def follow(state, aid, work):
     """Show the track of a receiver its newest measurement, whose innovation and noise are in ``work``."""
     if aid.stream == GNSS_POSITION:
@@ -74,8 +96,9 @@ def follow(state, aid, work):
 
 @njit
 def take_velocity(state, source, work):
-    """Let a velocity lead the track, for the time since the one before."""
-    if not is_live(state, GNSS_VELOCITY, source):
+    """Let a velocity lead the track, for the time since the one before; the first is a new beginning of the rate."""
+    if not is_led(state, source):
+        forget_rate(state, source)
         return
     dt = (state.stamp - state.aid_stamp[GNSS_VELOCITY, source]) * 1e-9
     for i in range(3):
@@ -86,7 +109,8 @@ def take_velocity(state, source, work):
 @njit
 def take_fix(state, source, work):
     """Let the track take a fix, if it belongs to it."""
-    if state.track_stamp[source] == NEVER:
+    last = state.track_stamp[source]
+    if last == NEVER or state.stamp - last > patience(state, GNSS_POSITION, source):
         start_track(state, source, work)
         return
     nis = predict_track(state, source, work)
@@ -94,9 +118,11 @@ def take_fix(state, source, work):
     if not nis <= MISS_GATE:
         state.track_misses[source] += 1
         if state.track_misses[source] >= MISSES:
+            note_jump_of_fixes(state, source, work)
             start_track(state, source, work)
         return
     state.track_misses[source] = 0
+    state.track_hit_stamp[source] = state.stamp
     for i in range(3):
         variance, mixed = state.track_offset_variance[source, i], state.track_mixed_variance[source, i]
         excess = offset_of_fix(state, source, i, work) - state.track_offset[source, i]
@@ -114,7 +140,8 @@ def predict_track(state, source, work):
     """Bring the track to the stamp of the newest fix; return the fix's normalised innovation squared."""
     dt = (state.stamp - state.track_stamp[source]) * 1e-9
     state.track_stamp[source] = state.stamp
-    noise = RATE_NOISE_DENSITY**2 * dt
+    density = RATE_NOISE_DENSITY if is_led(state, source) else INERTIAL_NOISE_DENSITY
+    noise = density**2 * dt
     nis = 0.0
     for i in range(3):
         mixed, rate = state.track_mixed_variance[source, i], state.track_rate_variance[source, i]
@@ -145,15 +172,35 @@ def offset_of_track(state, source, i):
 def start_track(state, source, work):
     """Start the track of a receiver anew from its newest fix."""
     state.track_stamp[source] = state.stamp
+    state.track_hit_stamp[source] = state.stamp
     state.track_misses[source] = 0
     state.track_rejected[source] = 0
     for i in range(3):
         state.track_offset[source, i] = offset_of_fix(state, source, i, work)
-        state.track_rate[source, i] = 0.0
         state.track_offset_variance[source, i] = work.noise[i, i]
+        state.velocity_lead_variance[source, i] = 0.0
+    forget_rate(state, source)
+
+
+@njit
+def forget_rate(state, source):
+    """Begin again with the rate of the track."""
+    for i in range(3):
+        state.track_rate[source, i] = 0.0
         state.track_mixed_variance[source, i] = 0.0
         state.track_rate_variance[source, i] = UNKNOWN_RATE_STD**2
-        state.velocity_lead_variance[source, i] = 0.0
+
+
+@njit
+def note_jump_of_fixes(state, source, work):
+    """Count a step aside of fixes that came without a break, with velocities that know nothing of it."""
+    if is_led(state, source) and state.stamp - state.track_hit_stamp[source] < UNBROKEN:
+        square = 0.0
+        for i in range(3):
+            square += (offset_of_fix(state, source, i, work) - state.track_offset[source, i]) ** 2
+        if square > LEAST_JUMP**2:
+            state.track_jumps[source] += 1
+            state.track_jump[source] = max(state.track_jump[source], math.sqrt(square))
 
 
 @njit
@@ -169,9 +216,13 @@ def forget_tracks(state):
 def measure_scatter(state, source, nis, work):
     """Take into account how far a fix is from its track, as a factor on the variance it claims.
 
+    Unless the track knows too little to tell.
     Whenever the factor in use has grown to so much the position pays for what was believed before: it is less certain
     by as much as a fix is.
     """
+    for i in range(3):
+        if state.track_offset_variance[source, i] > SCATTER_SHARE * work.noise[i, i]:
+            return
     scatter = state.scatter[source]
     factor = noise_factor(state, source)
     found = min(factor * nis / 3.0, SCATTER_CLIP * max(scatter, 1.0))
@@ -188,7 +239,7 @@ def measure_scatter(state, source, nis, work):
 @njit
 def is_contradicted(state, source):
     """Say whether the fixes of a receiver move otherwise than its velocities say."""
-    if not is_live(state, GNSS_VELOCITY, source):
+    if not is_led(state, source):
         return False
     square = 0.0
     nis = 0.0
