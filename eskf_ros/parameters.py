@@ -472,7 +472,27 @@ class Baro(Aid):
 @dataclass(frozen=True)
 class Zupt:
     enabled: bool = _parameter(
-        False, "", "While the vehicle stands still, hold velocity and turn rate at zero.", live=True
+        True,
+        "",
+        "While the vehicle stands still, hold velocity and turn rate at zero. Wheels, GNSS and the spread of the IMU's "
+        "readings tell when it does.",
+        live=True,
+    )
+    velocity_std: float = _parameter(
+        0.02,
+        "m/s",
+        "Standard deviation of the velocity of a vehicle that stands: it sways on its springs.",
+        above=0.0,
+        maximum=10.0,
+        live=True,
+    )
+    rate_std: float = _parameter(
+        1.0e-4,
+        "rad/s",
+        "Standard deviation of its turn rate, as a mean over one second.",
+        above=0.0,
+        maximum=1.0,
+        live=True,
     )
 
 

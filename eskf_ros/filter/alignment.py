@@ -219,8 +219,8 @@ def watch_stillness(state, settings):
         return
     still = is_still(state, settings) and state.motion_stamp < state.window_start and is_same_rest(state)
     watch_input(state, still, settings)
-    if state.position_known == 1 and state.last_fix_stamp < state.window_start:
-        # Without a fix since it began nobody knows whether a slow acceleration passes for a tilt.
+    if state.position_known == 1 and max(state.last_fix_stamp, state.resting_stamp) < state.window_start:
+        # Without a fix or wheels since it began nobody knows whether a slow acceleration passes for a tilt.
         still = False
     if not still:
         state.still_count = 0

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
-from eskf_ros.filter.aiding import gnss_position, gnss_velocity, nhc, wheel
+from eskf_ros.filter.aiding import gnss_position, gnss_velocity, nhc, wheel, zaru, zupt
 from eskf_ros.filter.alignment import (
     heading_of,
     move_datum,
@@ -49,7 +49,7 @@ from eskf_ros.filter.optional import join
 from eskf_ros.filter.output import status_of, write_odometry
 from eskf_ros.filter.recovery import is_near_gate, judge_filter, update_weighed_down, watch_solution
 from eskf_ros.filter.settings import intakes_from, settings_from
-from eskf_ros.filter.stillness import add_to_block, watch_wheels
+from eskf_ros.filter.stillness import add_to_block, note_evidence, watch_wheels
 from eskf_ros.filter.strapdown import SECOND, propagate
 from eskf_ros.filter.timeline import (
     CHECKPOINT_SPACING,
@@ -74,6 +74,8 @@ StampArray = npt.NDArray[np.int64]
 GNSS_POSITION = int(Stream.GNSS_POSITION)
 GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
 WHEEL = int(Stream.WHEEL)
+ZUPT = int(Stream.ZUPT)
+ZARU = int(Stream.ZARU)
 NHC = int(Stream.NHC)
 OPEN_DOOR = int(Verdict.WAITING)
 FIRST_CONSTRAINT = int(min(CONSTRAINTS))
@@ -181,6 +183,7 @@ def fuse(state, aids, i, settings, work):
         note_position(state, aid, settings)
     elif aid.stream == GNSS_VELOCITY:
         note_velocity(state, aid, settings)
+    note_evidence(state, aid, settings)
     if not is_aligned_for(state, aid.stream):
         aid.verdict = BEFORE_ALIGNMENT if aid.stream < FIRST_CONSTRAINT else INACTIVE
         return
@@ -235,6 +238,10 @@ def linearize(state, aid, settings, work):
         return gnss_position.linearize(state, aid.payload, aid.source, settings, work)
     if aid.stream == WHEEL:
         return wheel.linearize(state, aid.payload, settings, work)
+    if aid.stream == ZUPT:
+        return zupt.linearize(state, settings, work)
+    if aid.stream == ZARU:
+        return zaru.linearize(state, settings, work)
     if aid.stream == NHC:
         return nhc.linearize(state, settings, work)
     return gnss_velocity.linearize(state, aid.payload, aid.source, settings, work)

@@ -153,6 +153,8 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
 def describe_vehicle(settings: np.void, parameters: Parameters) -> None:
     """Fill in what wheels and the constraints of a vehicle need: arms from the IMU in its axes, deviations."""
     wheel, nhc = parameters.wheel, parameters.nhc
+    settings["zupt_velocity_std"] = parameters.zupt.velocity_std
+    settings["zupt_rate_std"] = parameters.zupt.rate_std
     for name, position in (("wheel", wheel.position), ("nhc", nhc.position)):
         arm_base = np.subtract(position, parameters.imu.mount_position)
         settings[f"{name}_arm_body"] = arm_base @ settings["imu_to_base"]

@@ -35,6 +35,7 @@ class RandomStream(IntEnum):
     DUAL_ANTENNA = 7
     BODY_VELOCITY = 8
     SECOND_GNSS = 9
+    VIBRATION = 11
 
 
 @dataclass(frozen=True)
