@@ -556,6 +556,16 @@ class BodyVelocity(Aid):
     unknown_std: float = _parameter(
         0.2, "m/s", "Standard deviation per axis where the message gives none.", above=0.0, maximum=100.0, live=True
     )
+    mount_position: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0), "m", "Position of the sensor in base_link.", minimum=-1000.0, maximum=1000.0
+    )
+    mount_rpy_deg: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0),
+        "deg",
+        "Orientation of the axes of its velocity in base_link: roll, pitch, yaw about fixed axes as in a URDF.",
+        minimum=-360.0,
+        maximum=360.0,
+    )
 
 
 @dataclass(frozen=True)
@@ -716,7 +726,27 @@ class Ranges(Aid):
 @dataclass(frozen=True)
 class Zupt:
     enabled: bool = _parameter(
-        False, "", "While the vehicle stands still, hold velocity and turn rate at zero.", live=True
+        False,
+        "",
+        "While the vehicle stands still, hold velocity and turn rate at zero. Wheels, GNSS and the spread of the IMU's "
+        "readings tell when it does.",
+        live=True,
+    )
+    velocity_std: float = _parameter(
+        0.02,
+        "m/s",
+        "Standard deviation of the velocity of a vehicle that stands: it sways on its springs.",
+        above=0.0,
+        maximum=10.0,
+        live=True,
+    )
+    rate_std: float = _parameter(
+        1.0e-4,
+        "rad/s",
+        "Standard deviation of its turn rate, as a mean over one second.",
+        above=0.0,
+        maximum=1.0,
+        live=True,
     )
 
 

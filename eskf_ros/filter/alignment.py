@@ -235,8 +235,8 @@ def watch_stillness(state, settings):
         return
     still = is_still(state, settings) and state.motion_stamp < state.window_start and is_same_rest(state, settings)
     watch_input(state, still, settings)
-    if state.position_known == 1 and state.last_fix_stamp < state.window_start:
-        # Without a fix since it began nobody knows whether a slow acceleration passes for a tilt.
+    if state.position_known == 1 and max(state.last_fix_stamp, state.resting_stamp) < state.window_start:
+        # Without a fix or wheels since it began nobody knows whether a slow acceleration passes for a tilt.
         still = False
     if not still:
         state.still_count = 0
@@ -295,6 +295,7 @@ def note_speed(state, speed, since, stamp, settings):
     if speed <= MOVING_SPEED:
         return
     state.motion_stamp = stamp
+    state.moving_stamp = stamp
     waiting = state.heading_known == 0 and state.level_known == 1 and state.still_stamp != NEVER
     if waiting and speed > MOVING_SPEED + STRONGEST_START * (stamp - min(since, state.still_stamp)) * 1e-9:
         distrust_level(state, settings)

@@ -241,12 +241,26 @@ STATE = np.dtype(
         ("sway_force", "f8"),
         ("sway_rate", "f8"),
         # IMU samples since the last point on the grid of the constraints: the point after them, whether one is missing,
-        # how many, sums.
+        # how many, sums, and the sums of their first half.
         ("block_end", "i8"),
         ("block_broken", "i8"),
         ("block_count", "i8"),
         ("block_sum", "f8", (6,)),
         ("block_square_sum", "f8", (6,)),
+        ("block_half_count", "i8"),
+        ("block_half_sum", "f8", (6,)),
+        # Rest and motion: when another sensor last saw them, how quiet the IMU is in either, and whether it was until
+        # the last grid point; fix and pressure when it became so.
+        ("moving_stamp", "i8"),
+        ("resting_stamp", "i8"),
+        ("moving_level", "f8"),
+        ("resting_level", "f8"),
+        ("quiet", "i8"),
+        ("quiet_fix_stamp", "i8"),
+        ("quiet_fix_variance", "f8"),
+        ("quiet_fix_ecef", "f8", (3,)),
+        ("quiet_pressure_stamp", "i8"),
+        ("quiet_pressure", "f8"),
         # Wheels: when they spoke last, and when the gate last refused to believe them.
         ("wheel_stamp", "i8"),
         ("slip_stamp", "i8"),
@@ -439,6 +453,10 @@ SETTINGS = np.dtype(
         ("mag_error_distance", "f8"),
         ("is_orientation_magnetic", "i8"),
         ("correlated_share", "f8"),
+        ("zupt_velocity_std", "f8"),
+        ("zupt_rate_std", "f8"),
+        ("body_velocity_arm_body", "f8", (3,)),
+        ("body_velocity_axes_body", "f8", (3, 3)),
         ("wheel_arm_body", "f8", (3,)),
         ("wheel_slip", "f8"),
         ("nhc_arm_body", "f8", (3,)),
@@ -517,6 +535,7 @@ WORK = np.dtype(
         ("innovation", "f8", (3,)),
         ("noise", "f8", (3, 3)),
         ("effect", "f8", (3, 4)),
+        ("shared", "f8", (3, ERROR_CAPACITY)),
         ("projected", "f8", (3, ERROR_CAPACITY)),
         ("innovation_covariance", "f8", (3, 3)),
         ("gain", "f8", (ERROR_CAPACITY, 3)),
@@ -539,7 +558,10 @@ WORK = np.dtype(
     ],
     align=True,
 )
-"""Scratch memory of the kernels: nothing is allocated per sample."""
+"""Scratch memory of the kernels: nothing is allocated per sample.
+
+``shared``: covariance of the noise of a measurement with the errors, zero but where an aid says otherwise.
+"""
 
 ODOMETRY = np.dtype(
     [
@@ -578,7 +600,19 @@ def allocate(dtype: np.dtype, count: int = 1) -> np.ndarray:
     return memory if COMPILED else memory.view(np.recarray)
 
 
-_EVIDENCE = ("still_stamp", "motion_stamp", "last_fix_stamp", "anchor_stamp", "block_end", "wheel_stamp", "slip_stamp")
+_EVIDENCE = (
+    "still_stamp",
+    "motion_stamp",
+    "last_fix_stamp",
+    "anchor_stamp",
+    "block_end",
+    "moving_stamp",
+    "resting_stamp",
+    "quiet_fix_stamp",
+    "quiet_pressure_stamp",
+    "wheel_stamp",
+    "slip_stamp",
+)
 _RECOVERY = ("aid_stamp", "aid_fused_stamp", "aid_fused_since", "track_stamp", "reset_stamp")
 _MONITORS = ("fault_stamp", "departure_stamp", "seen_stamp", "heading_mark_stamp")
 

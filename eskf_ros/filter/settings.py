@@ -213,7 +213,14 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
 def describe_vehicle(settings: np.void, parameters: Parameters) -> None:
     """Fill in what wheels and the constraints of a vehicle need: arms from the IMU in its axes, deviations."""
     wheel, nhc = parameters.wheel, parameters.nhc
-    for name, position in (("wheel", wheel.position), ("nhc", nhc.position)):
+    settings["zupt_velocity_std"] = parameters.zupt.velocity_std
+    settings["zupt_rate_std"] = parameters.zupt.rate_std
+    body = parameters.body_velocity
+    roll, pitch, yaw = (math.radians(angle) for angle in body.mount_rpy_deg)
+    sensor_to_base = np.array(to_matrix(from_roll_pitch_yaw(roll, pitch, yaw)))
+    settings["body_velocity_axes_body"] = sensor_to_base.T @ settings["imu_to_base"]
+    arms = (("wheel", wheel.position), ("nhc", nhc.position), ("body_velocity", body.mount_position))
+    for name, position in arms:
         arm_base = np.subtract(position, parameters.imu.mount_position)
         settings[f"{name}_arm_body"] = arm_base @ settings["imu_to_base"]
     settings["wheel_slip"] = wheel.slip
