@@ -30,6 +30,7 @@ OPTIONAL_SIZES = {
     "wheel_scale": 1,
     "clock": 2,
     "inter_system": 6,
+    "heading_offset": 1,
     "baro_offset": 1,
     "baro_scale": 1,
     "mag_error": 1,
