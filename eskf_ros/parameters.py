@@ -415,6 +415,22 @@ class Heading(Aid):
         minimum=-360.0,
         maximum=360.0,
     )
+    offset_std_deg: float = _parameter(
+        0.5,
+        "deg",
+        "Standard deviation at first of what all messages are wrong by alike: how well the baseline is known in "
+        "base_link, and multipath at the antennas. It is estimated as the vehicle accelerates; 0: there is none.",
+        minimum=0.0,
+        maximum=90.0,
+    )
+    offset_random_walk: float = _parameter(
+        2.0e-4,
+        "rad/rtHz",
+        "How fast that wanders: by this value times the square root of the seconds passed. The default is 0.36 deg in "
+        "1000 s.",
+        minimum=0.0,
+        maximum=1.0,
+    )
     std_floor_deg: float = _parameter(
         0.2, "deg", "The standard deviation is never taken smaller than this.", above=0.0, maximum=90.0, live=True
     )
