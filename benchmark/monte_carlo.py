@@ -93,7 +93,7 @@ def feed(recording: Recording, navigator: Navigator, stops: NDArray[np.int64]) -
     makes no difference to the state (principle of the timeline) but to the time it takes.
     """
     fix = velocity = sample = 0
-    others = [_wheel_messages(recording), _body_velocity_messages(recording)]
+    others = [wheel_messages(recording), body_velocity_messages(recording)]
     given = [0] * len(others)
     for i in stops:
         now = recording.imu_arrival[i]
@@ -127,7 +127,7 @@ def feed(recording: Recording, navigator: Navigator, stops: NDArray[np.int64]) -
         yield int(i), navigator.state[0]
 
 
-def _wheel_messages(recording: Recording) -> list[tuple[Any, ...]]:
+def wheel_messages(recording: Recording) -> list[tuple[Any, ...]]:
     """Arguments of `Navigator.push` of all messages of the wheels; the last is the arrival."""
     wheel = recording.wheel
     if wheel is None:
@@ -140,7 +140,7 @@ def _wheel_messages(recording: Recording) -> list[tuple[Any, ...]]:
     ]
 
 
-def _body_velocity_messages(recording: Recording) -> list[tuple[Any, ...]]:
+def body_velocity_messages(recording: Recording) -> list[tuple[Any, ...]]:
     """The same of the sensor of body velocity."""
     body = recording.body_velocity
     if body is None:

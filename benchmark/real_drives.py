@@ -72,7 +72,6 @@ NO_WHEEL = "wheel.use: false"
 NHC = ("nhc.enabled: true", *tsukishima.REAR_AXLE)
 CORRELATED = "gnss.correlation_time: 30.0"
 TIGHT = ("mode: tight", f"ranges.time_offset: {tsukishima.TIME_OFFSET}")
-STREET_MASKS = ("ranges.cn0_mask: 38.0", "ranges.elevation_mask_deg: 25.0")
 
 INPUTS = (Variant("position only", (POSITION,)), Variant("with velocity"))
 TSUKISHIMA = (
@@ -90,8 +89,7 @@ TSUKISHIMA_RANGES = (
     Variant("loose, with velocity", (NO_WHEEL,)),
     Variant("loose, with velocity, correlated errors", (NO_WHEEL, CORRELATED)),
     Variant("tight", (*TIGHT, NO_WHEEL)),
-    Variant("tight, masks for streets", (*TIGHT, *STREET_MASKS, NO_WHEEL)),
-    Variant("tight, masks for streets, wheel, NHC", (*TIGHT, *STREET_MASKS, *NHC)),
+    Variant("tight, wheel, NHC", (*TIGHT, *NHC)),
 )
 RANGES = (
     Variant("loose, position only", (POSITION,)),
@@ -99,11 +97,12 @@ RANGES = (
     Variant("tight", TIGHT[:1]),
 )
 HUSKY = (
-    Variant("as installed", (NO_WHEEL,), chosen_noise=False),
-    Variant("chosen noise", (NO_WHEEL,)),
-    Variant("chosen noise, heading given", (NO_WHEEL, *husky.HEADING)),
-    Variant("chosen noise, heading given, wheel", husky.HEADING),
-    Variant("chosen noise, heading given, wheel, NHC", ("nhc.enabled: true", *husky.HEADING)),
+    Variant("without wheels", (NO_WHEEL,), chosen_noise=False),
+    Variant("without wheels, chosen noise", (NO_WHEEL,)),
+    Variant("without wheels, chosen noise, heading given", (NO_WHEEL, *husky.HEADING)),
+    Variant("wheels", chosen_noise=False),
+    Variant("wheels, chosen noise"),
+    Variant("wheels, chosen noise, NHC", ("nhc.enabled: true",)),
 )
 NAGOYA_GRADES = ("consumer", "industrial", "tactical")
 KNOWN_HEADING_DEG = 30.0

@@ -415,6 +415,22 @@ class Heading(Aid):
         minimum=-360.0,
         maximum=360.0,
     )
+    offset_std_deg: float = _parameter(
+        0.5,
+        "deg",
+        "Standard deviation at first of what all messages are wrong by alike: how well the baseline is known in "
+        "base_link, and multipath at the antennas. It is estimated as the vehicle accelerates; 0: there is none.",
+        minimum=0.0,
+        maximum=90.0,
+    )
+    offset_random_walk: float = _parameter(
+        2.0e-4,
+        "rad/rtHz",
+        "How fast that wanders: by this value times the square root of the seconds passed. The default is 0.36 deg in "
+        "1000 s.",
+        minimum=0.0,
+        maximum=1.0,
+    )
     std_floor_deg: float = _parameter(
         0.2, "deg", "The standard deviation is never taken smaller than this.", above=0.0, maximum=90.0, live=True
     )
@@ -555,6 +571,16 @@ class BodyVelocity(Aid):
     )
     unknown_std: float = _parameter(
         0.2, "m/s", "Standard deviation per axis where the message gives none.", above=0.0, maximum=100.0, live=True
+    )
+    mount_position: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0), "m", "Position of the sensor in base_link.", minimum=-1000.0, maximum=1000.0
+    )
+    mount_rpy_deg: tuple[float, ...] = _parameter(
+        (0.0, 0.0, 0.0),
+        "deg",
+        "Orientation of the axes of its velocity in base_link: roll, pitch, yaw about fixed axes as in a URDF.",
+        minimum=-360.0,
+        maximum=360.0,
     )
 
 
@@ -716,7 +742,27 @@ class Ranges(Aid):
 @dataclass(frozen=True)
 class Zupt:
     enabled: bool = _parameter(
-        False, "", "While the vehicle stands still, hold velocity and turn rate at zero.", live=True
+        False,
+        "",
+        "While the vehicle stands still, hold velocity and turn rate at zero. Wheels, GNSS and the spread of the IMU's "
+        "readings tell when it does.",
+        live=True,
+    )
+    velocity_std: float = _parameter(
+        0.02,
+        "m/s",
+        "Standard deviation of the velocity of a vehicle that stands: it sways on its springs.",
+        above=0.0,
+        maximum=10.0,
+        live=True,
+    )
+    rate_std: float = _parameter(
+        1.0e-4,
+        "rad/s",
+        "Standard deviation of its turn rate, as a mean over one second.",
+        above=0.0,
+        maximum=1.0,
+        live=True,
     )
 
 

@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 from aided import AidedNavigator, run_aided
 from kernels import Array, make_settings, make_state, make_work, random_state, with_error
-from monte_carlo import feed, nees
+from monte_carlo import feed, nees, run
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from test_aiding import geodetic_of, local_axes_in_map
 
 from eskf_ros.bags import Batch, message_dtype
+from eskf_ros.filter import optional
 from eskf_ros.filter.aiding import heading
-from eskf_ros.filter.layout import Status, Stream, Verdict
+from eskf_ros.filter.layout import ERROR_SIZE, Status, Stream, Verdict
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.inputs import INPUTS
 from eskf_ros.simulate.dual_antenna import DualAntenna
@@ -25,6 +26,7 @@ from eskf_ros.simulate.scenario import simulate
 
 SECOND = 1_000_000_000
 MOUNT = {"imu__mount_position": [0.3, 0.1, -0.2], "imu__mount_rpy_deg": [10.0, -20.0, 130.0]}
+YAW = slice(8, 9)
 SETTINGS = make_settings(heading__mount_rpy_deg=[0.0, -7.0, 80.0], **MOUNT)
 
 seeds = pytest.mark.parametrize("seed", range(5))
@@ -90,6 +92,19 @@ def test_the_innovation_is_the_short_way_round(turns: float, off: float) -> None
         measured = math.radians(yaw_deg) + off + math.tau * turns
         heading.linearize(state, payload(measured, 0.0, (1e-4, -1.0)), 0, settings, work)
         assert work["innovation"][0] == pytest.approx(off, abs=1e-6)
+
+
+def test_the_offset_is_in_yaw_alone() -> None:
+    state, plain, work = levelled(1, 0.0), make_work(), make_work()
+    heading.linearize(state, payload(0.3, 0.1, (1e-4, 4e-4)), 0, SETTINGS, plain)
+    optional.join(state, SETTINGS["reach"][Stream.HEADING], SETTINGS)
+    place = int(SETTINGS["heading_offset_at"])
+    state["optional"][place - ERROR_SIZE] = 0.02
+    heading.linearize(state, payload(0.3, 0.1, (1e-4, 4e-4)), 0, SETTINGS, work)
+    np.testing.assert_allclose(plain["innovation"][:2] - work["innovation"][:2], (0.02, 0.0), rtol=0.0, atol=1e-12)
+    np.testing.assert_array_equal(work["jacobian"][:2, place], (1.0, 0.0))
+    heading.linearize(state, payload(0.3, 0.1, (1e-4, 4e-4)), 1, SETTINGS, work)
+    assert (work["jacobian"][:, place] == 0.0).all()
 
 
 def test_what_was_not_measured_is_left_out() -> None:
@@ -251,6 +266,28 @@ def test_the_covariance_is_honest_with_a_dual_antenna(name: str) -> None:
     assert max(known) < 6.0
     assert 1.0 < np.mean(attitude) < 6.0, attitude
     assert 1.5 < np.mean(position) < 5.0, position
+
+
+def test_a_baseline_askew_is_part_of_the_sigma_and_found_on_the_way() -> None:
+    """Antennas mounted some degree off: with the state for it the heading is honest, without it is not."""
+    means: dict[float, list[float]] = {1.5: [], 0.0: []}
+    for seed in range(4):
+        recording = simulate("drive", seed, imu_rate=50.0, stop=80.0, dual_antenna=DualAntenna())
+        askew = 1.5 * float(np.random.default_rng(seed).normal())
+        for std, values in means.items():
+            changes = {"heading__mount_rpy_deg": [0.0, 0.0, askew], "heading__offset_std_deg": std}
+            navigator = AidedNavigator(recording, **changes, alignment__use_course=False)
+            result = run(recording, navigator)
+            parts = np.array_split(nees(result.error[result.aligned], result.covariance[result.aligned], YAW), 8)
+            values += [part.mean() for part in parts]
+            if std > 0.0:
+                state, place = navigator.state[0], int(navigator._settings["heading_offset_at"][0])
+                # What is measured is less than what it is said to be by as much as the baseline is told to be askew.
+                off = state["optional"][place - ERROR_SIZE] + math.radians(askew)
+                assert abs(off) < 4.0 * math.sqrt(state["covariance"][place, place])
+                assert abs(math.degrees(off)) < 0.4
+    assert 0.2 < np.mean(means[1.5]) < 2.5, means
+    assert np.mean(means[0.0]) > 10.0, means
 
 
 # ------------------------------------------------------------------------------------------------- what goes wrong

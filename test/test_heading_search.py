@@ -19,6 +19,7 @@ from eskf_ros.simulate.scenario import Recording, simulate
 DT = 0.01
 VELOCITY_STD, POSITION_STD = 0.1, 1.0
 LEVER = np.array([0.8, -0.3])
+UNTURNED = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class Search:
@@ -29,7 +30,7 @@ class Search:
         self.settings = make_settings(**parameters)
         self.state, self.work = make_state(), make_work()
         self.state["heading_known"] = 0
-        note_level(self.state, 0.0)
+        note_level(self.state, 0.0, 0.0, UNTURNED, self.settings)
         self.to_map = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
         self.position, self.velocity = np.zeros(2), np.zeros(2)
         self.tilt = self.random.normal(0.0, 0.01, 2)
@@ -43,7 +44,7 @@ class Search:
             self.position += DT * self.velocity + 0.5 * DT**2 * in_map
             self.velocity += DT * in_map
             measured = np.add(acceleration, self.tilt) + self.random.normal(0.0, noise, 2)
-            predict_search(self.state, tuple(measured), 0.0, DT, self.settings)
+            predict_search(self.state, tuple(measured), UNTURNED, DT, self.settings)
             if k % 20 == 19:
                 self.fix(0, self.position + self.to_map @ LEVER, POSITION_STD, LEVER)
                 if velocity:
@@ -100,7 +101,7 @@ def test_the_lever_arm_turns_with_the_heading():
     search.tilt[:] = 0.0
     arm = np.array([2.0, 0.0])
     for k in range(600):
-        predict_search(search.state, (0.0, 0.0), 0.0, DT, search.settings)
+        predict_search(search.state, (0.0, 0.0), UNTURNED, DT, search.settings)
         angle = 0.01 * k
         lever = np.array([math.cos(angle) * arm[0], math.sin(angle) * arm[0]])
         if k % 20 == 19:
@@ -118,6 +119,65 @@ def test_a_model_that_does_not_hold_is_not_believed():
         search.velocity += 2.0 * 0.2 * search.to_map[:, 0]
     assert np.hypot(*search.state["search"][4:6]) > 1.5
     assert turn_found(search.state)[1] == math.inf
+
+
+def turned(angle: float) -> Any:
+    c, s = math.cos(angle), math.sin(angle)
+    return ((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0))
+
+
+def test_a_bias_that_the_level_hid_comes_out_as_the_body_turns():
+    """Quarter turns on the spot between short drives, levelled again on the way; (cos, sin) and bias stay honest."""
+    bias_std, squares, bias_squares = 0.2, [], []
+    for seed in range(40):
+        search = Search(seed, 1.0)
+        bias = search.random.normal(0.0, bias_std, 2)
+        angle, hidden = 0.0, bias
+        search.tilt[:] = 0.0
+        search.state["search_started"] = 0
+        note_level(search.state, 0.0, bias_std**2, turned(angle), search.settings)
+        begin_search(search.state, *search.random.normal(search.to_map @ LEVER, POSITION_STD), POSITION_STD**2)
+        for k in range(2400):
+            second = k * DT % 6.0
+            acceleration = np.array(turned(angle))[:2, 0] * (0.4 if second < 2.0 else -0.4 if second > 4.0 else 0.0)
+            if k % 900 == 899:
+                hidden = np.array(turned(angle))[:2, :2] @ bias
+                note_level(search.state, 0.0, bias_std**2, turned(angle), search.settings)
+            search.position += DT * search.velocity
+            search.velocity += DT * search.to_map @ acceleration
+            noise = search.random.normal(0.0, search.settings["accel_noise_density"] / math.sqrt(DT), 2)
+            measured = acceleration + np.array(turned(angle))[:2, :2] @ bias - hidden + noise
+            predict_search(search.state, tuple(measured), turned(angle), DT, search.settings)
+            angle += DT * math.pi / 2.0 if 2.0 <= second < 3.0 else 0.0
+            if k % 20 == 19:
+                search.fix(0, search.position + search.to_map @ LEVER, POSITION_STD, LEVER)
+        x, p = search.state["search"], search.state["search_covariance"]
+        off = x[4:6] - search.to_map[:, 0]
+        squares.append(off @ np.linalg.solve(p[4:6, 4:6], off))
+        # What is added to the measured acceleration: the opposite of the bias.
+        off = x[8:10] + search.to_map @ bias
+        bias_squares.append(off @ np.linalg.solve(p[8:10, 8:10], off))
+        assert np.sqrt(np.diag(p)[8:10]).max() < 0.7 * bias_std
+    for found in (squares, bias_squares):
+        assert chi2.ppf(1e-4, 80) < sum(found) < chi2.ppf(1.0 - 1e-4, 80), sum(found) / 80
+
+
+@pytest.mark.parametrize(("name", "start", "stop"), [("field_robot", 7.0, 95.0), ("drive", 60.0, 90.0)])
+def test_the_search_stays_honest_for_long(name: str, start: float, stop: float) -> None:
+    """Fixes alone, never decided: turns on the spot, slopes, even braking that looks like a tilt at rest."""
+    squares = []
+    for seed in range(8):
+        yaw = float(np.random.default_rng(seed).uniform(-180.0, 180.0))
+        mount = (0.0, 0.0, yaw)
+        recording = simulate(name, seed, grade="consumer", imu_rate=50.0, start=start, stop=stop, imu_rpy_deg=mount)
+        undecided = {"alignment.found_heading_std_deg": 1e-3, "alignment.use_course": False}
+        navigator, error = run(recording, velocity=False, **undecided)
+        state = navigator.state[0]
+        p = state["search_covariance"][4:6, 4:6]
+        off = state["search"][4:6] - (math.cos(error), -math.sin(error))
+        squares.append(off @ np.linalg.solve(p, off))
+        assert np.sqrt(np.diag(p)).max() < 0.15
+    assert sum(squares) < chi2.ppf(0.9999, 16), squares
 
 
 def heading_of(quaternion: np.ndarray) -> float:

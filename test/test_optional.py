@@ -51,7 +51,7 @@ def test_nothing_is_in_use_by_default() -> None:
     """But for what wheels need, once there are any."""
     plain = make_settings()
     assert plain["position_error_at"] == NOWHERE
-    assert (plain["reach"][[Stream.GNSS_POSITION, Stream.GNSS_VELOCITY, Stream.HEADING]] == ERROR_SIZE).all()
+    assert (plain["reach"][[Stream.GNSS_POSITION, Stream.GNSS_VELOCITY]] == ERROR_SIZE).all()
 
 
 def test_joining_gives_the_first_variance_and_no_correlation() -> None:

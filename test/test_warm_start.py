@@ -97,6 +97,15 @@ def test_a_robot_that_was_moved_forgets_its_heading(parked):
     assert run(parked, elsewhere).status == Status.WAITING_HEADING
 
 
+def test_a_reset_forgets_the_earlier_run_too(parked):
+    """The robot may have turned where it stands."""
+    navigator = run(parked, true_memory(parked))
+    assert navigator.status == Status.GOOD
+    navigator.reset()
+    feed(navigator, parked)
+    assert navigator.status == Status.WAITING_HEADING
+
+
 def test_remembered_heading_means_the_same_under_another_datum(parked):
     """East at the robot is not the x axis of a map whose origin is two degrees away."""
     memory = true_memory(parked)

@@ -40,7 +40,7 @@ from eskf_ros.filter.layout import (
 )
 from eskf_ros.filter.monitors import watch_input
 from eskf_ros.filter.strapdown import gravity_map
-from eskf_ros.filter.sway import can_be_bias, note_sway
+from eskf_ros.filter.sway import MOVING_SPEED, can_be_bias, is_moving, note_sway
 from eskf_ros.filter.track import forget_tracks
 from eskf_ros.filter.warm_start import do_biases_hold
 from eskf_ros.rotation import (
@@ -62,7 +62,6 @@ GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
 
 START_POSITION_STD = 1000.0
 START_VELOCITY_STD = 100.0
-MOVING_SPEED = 0.5
 POSITION_SIGMAS = 5.0
 VELOCITY_SIGMAS = 3.0
 """What GNSS has to exceed (m/s) by so many sigma to prove motion.
@@ -235,8 +234,8 @@ def watch_stillness(state, settings):
         return
     still = is_still(state, settings) and state.motion_stamp < state.window_start and is_same_rest(state, settings)
     watch_input(state, still, settings)
-    if state.position_known == 1 and state.last_fix_stamp < state.window_start:
-        # Without a fix since it began nobody knows whether a slow acceleration passes for a tilt.
+    if state.position_known == 1 and max(state.last_fix_stamp, state.resting_stamp) < state.window_start:
+        # Without a fix or wheels since it began nobody knows whether a slow acceleration passes for a tilt.
         still = False
     if not still:
         state.still_count = 0
@@ -295,6 +294,7 @@ def note_speed(state, speed, since, stamp, settings):
     if speed <= MOVING_SPEED:
         return
     state.motion_stamp = stamp
+    state.moving_stamp = stamp
     waiting = state.heading_known == 0 and state.level_known == 1 and state.still_stamp != NEVER
     if waiting and speed > MOVING_SPEED + STRONGEST_START * (stamp - min(since, state.still_stamp)) * 1e-9:
         distrust_level(state, settings)
@@ -305,7 +305,7 @@ def distrust_level(state, settings):
     """Give tilt and gyro bias the uncertainty of a level taken while moving."""
     state.still_stamp = NEVER
     state.still_count = 0
-    note_level(state, settings.moving_tilt_std**2)
+    note_level(state, settings.moving_tilt_std**2, settings.accel_bias_std**2, to_matrix(state.attitude), settings)
     up = local_up(state)
     covariance = state.covariance
     for i in range(3):
@@ -380,8 +380,16 @@ def level(state, sums, count, interval, still, settings):
         bias, start_rate = (b[0], b[1], b[2]), (r[0], r[1], r[2])
         accel_bias_variance = settings.remembered_accel_bias_std**2
         gyro_bias_variance = settings.remembered_gyro_bias_std**2
-    if still and not can_be_bias(rate, start_rate, math.sqrt(gyro_bias_variance), mean_rate_std(duration, settings)):
-        # A slow turn, or a bias that nobody expected: what is not known to be rest has to wait as if it were motion.
+    is_first = count == state.window_count
+    if is_first:
+        keep_gyro_bias(state)
+    if state.kept_gyro_variance < gyro_bias_variance:
+        b = state.kept_gyro_bias
+        start_rate, gyro_bias_variance = (b[0], b[1], b[2]), state.kept_gyro_variance
+    can_be_rest = can_be_bias(rate, start_rate, math.sqrt(gyro_bias_variance), mean_rate_std(duration, settings))
+    if still and (state.moved_first == 1 or is_moving(state) or not can_be_rest):
+        # Even braking, a slow turn, or a bias that nobody expected: what is not known to be rest has to wait as if it
+        # were motion.
         state.still_stamp = NEVER
         state.still_count = 0
         if state.level_known == 1 or (state.stamp - state.first_stamp) * 1e-9 < settings.moving_start_after:
@@ -391,6 +399,18 @@ def level(state, sums, count, interval, still, settings):
     strength = math.sqrt(dot(force, force))
     if strength < 0.5 * STANDARD_GRAVITY:
         return
+    if still:
+        note_sway(state, is_first, settings)
+        walked = settings.accel_bias_random_walk**2 * duration / 3.0
+        swayed = state.sway_force * min(1.0, settings.static_duration / duration)
+        tilt_noise = (settings.accel_noise_density**2 / duration + walked + swayed) / strength**2
+        known = max(state.covariance[ATTITUDE, ATTITUDE], state.covariance[ATTITUDE + 1, ATTITUDE + 1])
+        if swayed > 0.0 and state.level_known == 1 and known < accel_bias_variance / strength**2 + tilt_noise:
+            # Not quite at rest, and the level is better known.
+            return
+    else:
+        turn_rate_square = (sums[3] ** 2 + sums[4] ** 2 + sums[5] ** 2) / count**2
+        tilt_noise = settings.moving_tilt_std**2 + turn_rate_square * (UNKNOWN_SPEED / strength) ** 2
     heading = heading_of(state, settings)
     up = local_up(state)
     measured = rotate(to_matrix(state.attitude), (force[0] / strength, force[1] / strength, force[2] / strength))
@@ -402,15 +422,7 @@ def level(state, sums, count, interval, still, settings):
         for j in range(ERROR_CAPACITY):
             covariance[i, j] = 0.0
             covariance[j, i] = 0.0
-    if still:
-        note_sway(state, count == state.window_count, settings)
-        walked = settings.accel_bias_random_walk**2 * duration / 3.0
-        swayed = state.sway_force * min(1.0, settings.static_duration / duration)
-        tilt_noise = (settings.accel_noise_density**2 / duration + walked + swayed) / strength**2
-    else:
-        turn_rate_square = (sums[3] ** 2 + sums[4] ** 2 + sums[5] ** 2) / count**2
-        tilt_noise = settings.moving_tilt_std**2 + turn_rate_square * (UNKNOWN_SPEED / strength) ** 2
-    note_level(state, tilt_noise)
+    note_level(state, tilt_noise, accel_bias_variance, rotation, settings)
     heading_variance = math.pi**2
     if state.heading_known == 1:
         heading_variance = settings.initial_heading_std**2
@@ -436,6 +448,19 @@ def level(state, sums, count, interval, still, settings):
         set_heading(state, settings.initial_heading, settings.initial_heading_std, settings)
     state.jump_heading += wrapped(heading_of(state, settings) - heading)
     state.level_known = 1
+
+
+@njit
+def keep_gyro_bias(state):
+    """Keep what is known of the gyro bias when a run of windows begins: the prior of what its windows say together."""
+    state.kept_gyro_variance = math.inf
+    if state.level_known == 0:
+        return
+    state.kept_gyro_variance = 0.0
+    for i in range(3):
+        state.kept_gyro_bias[i] = state.gyro_bias[i]
+        variance = state.covariance[GYRO_BIAS + i, GYRO_BIAS + i]
+        state.kept_gyro_variance = max(state.kept_gyro_variance, variance)
 
 
 @njit

@@ -46,6 +46,8 @@ def is_heading_told(state, aid, settings, work):
     if aid.stream == HEADING:
         rank = DUAL_ANTENNA if aid.source == 0 else IMU_ORIENTATION
     turn, std = work.innovation[0], math.sqrt(work.noise[0, 0])
+    if rank == DUAL_ANTENNA and settings.heading_offset_at < state.error_size:
+        std = math.hypot(std, settings.optional_std[settings.heading_offset_at - ERROR_SIZE])
     if rank == MAGNETOMETER:
         std = math.hypot(std, settings.optional_std[settings.mag_error_at - ERROR_SIZE])
     age = (aid.stamp - state.hint_stamp) * 1e-9

@@ -30,6 +30,7 @@ OPTIONAL_SIZES = {
     "wheel_scale": 1,
     "clock": 2,
     "inter_system": 6,
+    "heading_offset": 1,
     "baro_offset": 1,
     "baro_scale": 1,
     "mag_error": 1,
@@ -53,7 +54,7 @@ NOWHERE = ERROR_CAPACITY
 SOURCES = 2
 """GNSS receivers with antennas of their own, by their index."""
 
-SEARCH_SIZE = 8
+SEARCH_SIZE = 10
 """States of the search for the heading (see ``heading_search``)."""
 
 NEVER = -(2**62)
@@ -199,14 +200,12 @@ STATE = np.dtype(
         ("position_known", "i8"),
         ("heading_known", "i8"),
         ("first_stamp", "i8"),
-        # Search for the heading: position, velocity, cosine and sine, acceleration error; tilt variance (rad2) apart
-        # from the accelerometer bias, seconds and radians turned since the last level.
+        # Search for the heading: position, velocity, cosine and sine, tilt and accelerometer bias as accelerations;
+        # seconds since the last level.
         ("search_started", "i8"),
         ("search", "f8", (SEARCH_SIZE,)),
         ("search_covariance", "f8", (SEARCH_SIZE, SEARCH_SIZE)),
-        ("search_tilt_variance", "f8"),
         ("search_age", "f8"),
-        ("search_turn", "f8"),
         # What a sensor says of the unknown heading: its rank, how often it agreed with itself since when, the last
         # message, by how much (rad) it would turn the attitude, and its standard deviation.
         ("hint_rank", "i8"),
@@ -230,8 +229,9 @@ STATE = np.dtype(
         ("still_stamp", "i8"),
         ("still_count", "i8"),
         ("still_sum", "f8", (6,)),
-        # The window in parts (see ``sway``): the one being filled, sums of the means of the others; the largest
-        # variances of these means in the run.
+        # The window (see ``sway``): whether the robot moved when it began; the part being filled, sums of the means of
+        # the others; the largest variances of these means in the run.
+        ("moved_first", "i8"),
         ("part_start", "i8"),
         ("part_count", "i8"),
         ("part_sum", "f8", (6,)),
@@ -240,13 +240,30 @@ STATE = np.dtype(
         ("part_square_sum", "f8", (6,)),
         ("sway_force", "f8"),
         ("sway_rate", "f8"),
+        # What was known of the gyro bias before the run.
+        ("kept_gyro_bias", "f8", (3,)),
+        ("kept_gyro_variance", "f8"),
         # IMU samples since the last point on the grid of the constraints: the point after them, whether one is missing,
-        # how many, sums.
+        # how many, sums, and the sums of their first half.
         ("block_end", "i8"),
         ("block_broken", "i8"),
         ("block_count", "i8"),
         ("block_sum", "f8", (6,)),
         ("block_square_sum", "f8", (6,)),
+        ("block_half_count", "i8"),
+        ("block_half_sum", "f8", (6,)),
+        # Rest and motion: when another sensor last saw them, how quiet the IMU is in either, and whether it was until
+        # the last grid point; fix and pressure when it became so.
+        ("moving_stamp", "i8"),
+        ("resting_stamp", "i8"),
+        ("moving_level", "f8"),
+        ("resting_level", "f8"),
+        ("quiet", "i8"),
+        ("quiet_fix_stamp", "i8"),
+        ("quiet_fix_variance", "f8"),
+        ("quiet_fix_ecef", "f8", (3,)),
+        ("quiet_pressure_stamp", "i8"),
+        ("quiet_pressure", "f8"),
         # Wheels: when they spoke last, and when the gate last refused to believe them.
         ("wheel_stamp", "i8"),
         ("slip_stamp", "i8"),
@@ -441,6 +458,10 @@ SETTINGS = np.dtype(
         ("mag_error_distance", "f8"),
         ("is_orientation_magnetic", "i8"),
         ("correlated_share", "f8"),
+        ("zupt_velocity_std", "f8"),
+        ("zupt_rate_std", "f8"),
+        ("body_velocity_arm_body", "f8", (3,)),
+        ("body_velocity_axes_body", "f8", (3, 3)),
         ("wheel_arm_body", "f8", (3,)),
         ("wheel_slip", "f8"),
         ("nhc_arm_body", "f8", (3,)),
@@ -519,6 +540,7 @@ WORK = np.dtype(
         ("innovation", "f8", (3,)),
         ("noise", "f8", (3, 3)),
         ("effect", "f8", (3, 4)),
+        ("shared", "f8", (3, ERROR_CAPACITY)),
         ("projected", "f8", (3, ERROR_CAPACITY)),
         ("innovation_covariance", "f8", (3, 3)),
         ("gain", "f8", (ERROR_CAPACITY, 3)),
@@ -541,7 +563,10 @@ WORK = np.dtype(
     ],
     align=True,
 )
-"""Scratch memory of the kernels: nothing is allocated per sample."""
+"""Scratch memory of the kernels: nothing is allocated per sample.
+
+``shared``: covariance of the noise of a measurement with the errors, zero but where an aid says otherwise.
+"""
 
 ODOMETRY = np.dtype(
     [
@@ -580,7 +605,19 @@ def allocate(dtype: np.dtype, count: int = 1) -> np.ndarray:
     return memory if COMPILED else memory.view(np.recarray)
 
 
-_EVIDENCE = ("still_stamp", "motion_stamp", "last_fix_stamp", "anchor_stamp", "block_end", "wheel_stamp", "slip_stamp")
+_EVIDENCE = (
+    "still_stamp",
+    "motion_stamp",
+    "last_fix_stamp",
+    "anchor_stamp",
+    "block_end",
+    "moving_stamp",
+    "resting_stamp",
+    "quiet_fix_stamp",
+    "quiet_pressure_stamp",
+    "wheel_stamp",
+    "slip_stamp",
+)
 _RECOVERY = ("aid_stamp", "aid_fused_stamp", "aid_fused_since", "track_stamp", "reset_stamp")
 _MONITORS = ("fault_stamp", "departure_stamp", "seen_stamp", "heading_mark_stamp")
 
@@ -593,6 +630,7 @@ def blank_state() -> np.ndarray:
         state[field] = NEVER
     state["scatter"] = state["scatter_paid"] = 1.0
     state["attitude"][0, 0] = 1.0
+    state["kept_gyro_variance"] = np.inf
     state["error_size"] = ERROR_SIZE
     # Until there are two samples: longer than any gap, so that the first interval takes no bend from an earlier one.
     state["imu_interval"] = 1e9

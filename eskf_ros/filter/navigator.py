@@ -12,7 +12,18 @@ import numpy.typing as npt
 from eskf_ros.compiled import njit
 from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
 from eskf_ros.filter.aid_monitors import aid_complaints, watch_aid
-from eskf_ros.filter.aiding import baro, gnss_position, gnss_velocity, heading, mag, nhc, wheel
+from eskf_ros.filter.aiding import (
+    baro,
+    body_velocity,
+    gnss_position,
+    gnss_velocity,
+    heading,
+    mag,
+    nhc,
+    wheel,
+    zaru,
+    zupt,
+)
 from eskf_ros.filter.alignment import (
     heading_of,
     level_again,
@@ -54,7 +65,7 @@ from eskf_ros.filter.output import status_of, write_odometry
 from eskf_ros.filter.ranges import end_of_epoch, fuse_ranges, is_range, offer_signals
 from eskf_ros.filter.recovery import gate_of, phase_of, recover, watch_solution
 from eskf_ros.filter.settings import intakes_from, settings_from
-from eskf_ros.filter.stillness import add_to_block, watch_wheels
+from eskf_ros.filter.stillness import add_to_block, note_evidence, watch_wheels
 from eskf_ros.filter.strapdown import SECOND, propagate
 from eskf_ros.filter.sway import add_to_part
 from eskf_ros.filter.timeline import (
@@ -88,6 +99,9 @@ StampArray = npt.NDArray[np.int64]
 GNSS_POSITION = int(Stream.GNSS_POSITION)
 GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
 WHEEL = int(Stream.WHEEL)
+BODY_VELOCITY = int(Stream.BODY_VELOCITY)
+ZUPT = int(Stream.ZUPT)
+ZARU = int(Stream.ZARU)
 NHC = int(Stream.NHC)
 HEADING = int(Stream.HEADING)
 MAG = int(Stream.MAG)
@@ -210,6 +224,7 @@ def fuse(state, aids, i, settings, work):
     elif aid.stream == GNSS_VELOCITY:
         note_velocity(state, aid, settings)
         watch_course(state, aid, heading_of(state, settings), settings)
+    note_evidence(state, aid, settings)
     if not is_aligned_for(state, aid.stream):
         if aid.stream == WHEEL:
             search_with_wheels(state, aid.payload, settings.gate[WHEEL, 2], settings, work)
@@ -294,6 +309,12 @@ def linearize(state, aid, settings, work):
         return gnss_position.linearize(state, aid.payload, aid.source, settings, work)
     if aid.stream == WHEEL:
         return wheel.linearize(state, aid.payload, settings, work)
+    if aid.stream == BODY_VELOCITY:
+        return body_velocity.linearize(state, aid.payload, settings, work)
+    if aid.stream == ZUPT:
+        return zupt.linearize(state, settings, work)
+    if aid.stream == ZARU:
+        return zaru.linearize(state, settings, work)
     if aid.stream == NHC:
         return nhc.linearize(state, settings, work)
     if aid.stream == HEADING:
@@ -341,7 +362,12 @@ class Navigator:
             recall(*self._memory, parameters, self._settings[0])
 
     def reset(self) -> None:
-        """Forget everything, the datum too unless it is a parameter; records that were not taken are lost."""
+        """Forget everything, the datum too unless it is a parameter, and what an earlier run knew.
+
+        Records that were not taken are lost.
+        """
+        self._memory = None
+        self._settings["has_memory"] = 0
         self._blank = blank_state()
         if self.parameters.datum:
             latitude, longitude, altitude = self.parameters.datum
@@ -693,12 +719,6 @@ class Navigator:
         found = complaints(self._states[0]) + aid_complaints(self._states[0], self._settings[0])
         if self._field_problem:
             found.append(self._field_problem)
-        if self._stand_ins:
-            found.append(
-                f"{self._stand_ins} messages came without a covariance (unknown type or all zero): "
-                "gnss.status_std_horizontal, gnss.status_std_vertical and the unknown_..._std of the parameters stand "
-                "in for it"
-            )
         for stream, difference in self._stamp_difference.items():
             if 2 * self._refused_count[stream] > self._offered_count[stream]:
                 found.append(
@@ -707,6 +727,17 @@ class Navigator:
                     "time_offset of the stream"
                 )
         return found
+
+    @property
+    def notes(self) -> list[str]:
+        """What is worth knowing of the streams though nothing is wrong: one sentence each."""
+        if not self._stand_ins:
+            return []
+        return [
+            f"{self._stand_ins} messages came without a covariance (unknown type or all zero): "
+            "gnss.status_std_horizontal, gnss.status_std_vertical and the unknown_..._std of the parameters stand in "
+            "for it"
+        ]
 
     @property
     def held_bytes(self) -> int:

@@ -213,7 +213,14 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
 def describe_vehicle(settings: np.void, parameters: Parameters) -> None:
     """Fill in what wheels and the constraints of a vehicle need: arms from the IMU in its axes, deviations."""
     wheel, nhc = parameters.wheel, parameters.nhc
-    for name, position in (("wheel", wheel.position), ("nhc", nhc.position)):
+    settings["zupt_velocity_std"] = parameters.zupt.velocity_std
+    settings["zupt_rate_std"] = parameters.zupt.rate_std
+    body = parameters.body_velocity
+    roll, pitch, yaw = (math.radians(angle) for angle in body.mount_rpy_deg)
+    sensor_to_base = np.array(to_matrix(from_roll_pitch_yaw(roll, pitch, yaw)))
+    settings["body_velocity_axes_body"] = sensor_to_base.T @ settings["imu_to_base"]
+    arms = (("wheel", wheel.position), ("nhc", nhc.position), ("body_velocity", body.mount_position))
+    for name, position in arms:
         arm_base = np.subtract(position, parameters.imu.mount_position)
         settings[f"{name}_arm_body"] = arm_base @ settings["imu_to_base"]
     settings["wheel_slip"] = wheel.slip
@@ -232,6 +239,7 @@ def place_optional_states(settings: np.void, parameters: Parameters) -> None:
     baro, mag = parameters.baro, parameters.mag
     estimate = parameters.estimate
     mounting_std, mounting_walk = math.radians(estimate.mounting_std_deg), estimate.mounting_random_walk
+    offset_std, offset_walk = math.radians(parameters.heading.offset_std_deg), parameters.heading.offset_random_walk
     scale_std, scale_walk = estimate.wheel_scale_std, estimate.wheel_scale_random_walk
     ranges, is_tight = parameters.ranges, parameters.mode == "tight"
     time = ranges.correlation_time if is_tight else parameters.gnss.correlation_time
@@ -243,6 +251,7 @@ def place_optional_states(settings: np.void, parameters: Parameters) -> None:
         ("wheel_scale", estimate.wheel_scale, scale_std, scale_walk, 0.0, (Stream.WHEEL,)),
         ("clock", is_tight, START_CLOCK_STD, clock_noise, 0.0, (Stream.PSEUDORANGE, Stream.RANGE_RATE)),
         ("inter_system", is_tight, inter_system_stds(parameters), ranges.inter_system_noise, 0.0, ()),
+        ("heading_offset", offset_std > 0.0, offset_std, offset_walk, 0.0, (Stream.HEADING,)),
         # Not by whether it is used, which may change while running: places stay.
         ("baro_offset", True, baro.offset_std, baro.offset_random_walk, 0.0, (Stream.BARO,)),
         ("baro_scale", True, baro.scale_std, 0.0, 0.0, (Stream.BARO,)),

@@ -11,8 +11,6 @@ coning and sculling; Savage, Strapdown Analytics, ch. 7; Groves, sections 5.5 an
 
 from __future__ import annotations
 
-import math
-
 from eskf_ros.compiled import njit
 from eskf_ros.earth import STANDARD_GRAVITY, normal_gravity_ecef
 from eskf_ros.filter import optional
@@ -123,7 +121,7 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
         # The direction of the measured acceleration in the map is unknown: position and velocity live on GNSS alone.
         coupling = 0.0
         acceleration = (force[0] + gravity[0], force[1] + gravity[1], force[2] + gravity[2])
-        predict_search(state, acceleration, math.sqrt(dot(angle, angle)) / dt, dt, settings)
+        predict_search(state, acceleration, middle, dt, settings)
         velocity_noise += WANDER_TIME * (WANDER_ACCELERATION**2 + dot(acceleration, acceleration))
     for i in range(3):
         new_velocity = v[i] + coupling * (dv[i] - 0.5 * dt * turn[i] + dt * (gravity[i] - 2.0 * coriolis[i]))

@@ -1,4 +1,4 @@
-"""Slow motion that passes for rest: a boat in waves, sensors held in the hand.
+"""Motion that passes for rest: a boat in waves, sensors held in the hand, a car that brakes evenly.
 
 Within a window whose readings are quiet enough for rest, the mean rate would be taken for the gyro bias and the mean
 force for gravity. White noise and the vibration of an engine average out within a part of the window. What the means of
@@ -11,12 +11,19 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import EARTH_RATE
-from eskf_ros.filter.layout import NEVER
+from eskf_ros.filter.layout import NEVER, VELOCITY
+from eskf_ros.rotation import dot
 
 PART = 250_000_000
 """Length of a part (ns)."""
 
 FEWEST_PARTS = 4
+
+MOVING_SPEED = 0.5
+"""What is faster (m/s) beyond its uncertainty moves."""
+
+REST_SIGMAS = 2.0
+"""A window is no rest while the filter has a velocity of this many sigma: better one too few than even braking."""
 
 MORE_THAN_NOISE = 5.0
 """The variance of the means is above this many times that of white noise by accident in one of thousands of windows."""
@@ -29,6 +36,7 @@ BIAS_SIGMAS = 4.0
 def add_to_part(state):
     """Add the newest IMU sample to the part of the stillness window, whose beginning begins the parts anew."""
     if state.window_start == NEVER:
+        state.moved_first = 1 if is_moving(state) else 0
         state.part_start = state.stamp
         state.part_count = 0
         state.parts = 0
@@ -50,6 +58,18 @@ def add_to_part(state):
     state.parts += 1
     state.part_count = 0
     state.part_start = state.stamp
+
+
+@njit
+def is_moving(state):
+    """Say whether the velocity that GNSS has given the filter is rather not that of a robot at rest."""
+    if state.position_known == 0:
+        return False
+    v = state.velocity_map
+    variance = 0.0
+    for i in range(3):
+        variance = max(variance, state.covariance[VELOCITY + i, VELOCITY + i])
+    return math.sqrt(dot(v, v)) - REST_SIGMAS * math.sqrt(variance) > MOVING_SPEED
 
 
 @njit

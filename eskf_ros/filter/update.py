@@ -18,11 +18,12 @@ BAD_COVARIANCE = int(Verdict.BAD_COVARIANCE)
 
 @njit
 def update(state, size, gate, work):
-    """Fuse ``size`` scalars described by ``work.jacobian``, ``work.innovation``, ``work.noise``.
+    """Fuse ``size`` scalars described by ``work.jacobian``, ``work.innovation``, ``work.noise``, ``work.shared``.
 
     Returns the verdict and the normalised innovation squared; the state changes only when the verdict is fused.
     ``gate`` is the largest normalised innovation squared that is accepted. Joseph form with the full product
-    (I - K H) P (I - K H)' + K R K' (Groves, eq. 3.58), evaluated through its rank-``size`` parts.
+    (I - K H) P (I - K H)' + K R K' (Groves, eq. 3.58), evaluated through its rank-``size`` parts, and extended by the
+    covariance C of noise and errors (Brown and Hwang, Introduction to Random Signals, section 5.5).
     """
     project(state, size, work)
     if not invert_positive(work.innovation_covariance, size):
@@ -53,11 +54,11 @@ def update(state, size, gate, work):
 
 @njit
 def project(state, size, work):
-    """Write H P to ``work.projected`` and H P H' + R to ``work.innovation_covariance``."""
+    """Write H P + C' to ``work.projected`` and H P H' + H C + C' H' + R to ``work.innovation_covariance``."""
     covariance, n = state.covariance, state.error_size
     for a in range(size):
         for j in range(n):
-            work.projected[a, j] = 0.0
+            work.projected[a, j] = work.shared[a, j]
         for i in range(n):
             h = work.jacobian[a, i]
             if h != 0.0:
@@ -67,7 +68,7 @@ def project(state, size, work):
         for b in range(a + 1):
             total = work.noise[a, b]
             for j in range(n):
-                total += work.projected[a, j] * work.jacobian[b, j]
+                total += work.projected[a, j] * work.jacobian[b, j] + work.shared[b, j] * work.jacobian[a, j]
             work.innovation_covariance[a, b] = total
             work.innovation_covariance[b, a] = total
 
@@ -98,21 +99,26 @@ def invert_positive(matrix, size):
 
 @njit
 def joseph(state, size, work):
-    """Replace P by (I - K H) P (I - K H)' + K R K', exactly symmetric."""
+    """Replace P by (I - K H) P (I - K H)' + K R K' - (I - K H) C K' - K C' (I - K H)', exactly symmetric."""
     covariance, n, gain = state.covariance, state.error_size, work.gain
     for i in range(n):
         for a in range(size):
             k = gain[i, a]
             for j in range(n):
                 covariance[i, j] -= k * work.projected[a, j]
-    # ``covariance`` is (I - K H) P now. Both terms on the right are (this H' - K R) K'.
+    # ``covariance`` is (I - K H) P - K C' now. All that is missing is (this H' - K R + C - K H C) K'.
+    for a in range(size):
+        for b in range(size):
+            work.innovation_covariance[a, b] = work.noise[a, b]
+            for j in range(n):
+                work.innovation_covariance[a, b] += work.jacobian[a, j] * work.shared[b, j]
     for i in range(n):
         for a in range(size):
-            total = 0.0
+            total = work.shared[a, i]
             for j in range(n):
                 total += covariance[i, j] * work.jacobian[a, j]
             for b in range(size):
-                total -= gain[i, b] * work.noise[b, a]
+                total -= gain[i, b] * work.innovation_covariance[b, a]
             work.residual_gain[i, a] = total
     for i in range(n):
         for j in range(i + 1):

@@ -13,6 +13,9 @@ from eskf_ros.filter.aiding.wheel import repeated
 from eskf_ros.filter.alignment import search_with
 from eskf_ros.rotation import cross, rotate, to_matrix
 
+LEAST_SPEED = 0.7
+"""Slower wheels (m/s) tell no direction: counters of pulses read zero until the vehicle moves at 0.5 m/s."""
+
 SIDE_SLIP_TIME = 10.0
 """Seconds for which the course differs from the heading by the same angle."""
 
@@ -25,6 +28,8 @@ def search_with_wheels(state, payload, gate, settings, work):
     vehicle moves by no more than its course differs from its heading.
     """
     if state.heading_known == 1 or state.search_started == 0 or settings.use_course == 0 or payload[3] < 0.0:
+        return
+    if abs(payload[0]) < LEAST_SPEED:
         return
     rotation = to_matrix(state.attitude)
     forward, _left, _up = vehicle_axes(state, settings)

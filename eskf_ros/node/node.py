@@ -66,6 +66,7 @@ class EskfNode(Node):
         self.verdicts: dict[tuple[int, Verdict], int] = {}
         self.resets = 0
         self.latest_fixes: dict[Verdict, int] = {}
+        self._has_noted = False
         self.callbacks, self.callback_time, self.longest_callback = 0, 0.0, 0.0
         self._restarts = 0
         self.extrinsics = Extrinsics(self.parameters)
@@ -297,6 +298,9 @@ class EskfNode(Node):
             self._bias.publish(bias_message(row, self._imu_frame))
             if row["position_known"] and datum is not None:
                 self._filtered.publish(fix_message(row, datum, self.parameters.frames.base_link))
+        if self.navigator.notes and not self._has_noted:
+            self._has_noted = True
+            self.get_logger().warn("; ".join(self.navigator.notes))
         if self.navigator.restarts > self._restarts:
             self.get_logger().warn("the alignment began again: the IMU was silent, or fix after fix was rejected")
         self._restarts = self.navigator.restarts

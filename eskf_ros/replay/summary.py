@@ -136,7 +136,7 @@ class Summary:
 
     def warnings(self, navigator: Navigator, topics: TopicNames, parameters: Parameters) -> list[str]:
         """What the user should know, one line each."""
-        lines = navigator.complaints
+        lines = navigator.complaints + navigator.notes
         if navigator.restarts:
             lines.append(
                 f"the alignment started again {navigator.restarts} times: the IMU was silent for seconds, or fix after "

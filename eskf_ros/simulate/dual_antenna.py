@@ -45,7 +45,10 @@ class DualAntenna:
         """Return the estimator's parameters that describe this sensor, by dotted name."""
         x, y, z = self.baseline
         yaw, pitch = math.atan2(y, x), math.atan2(-z, math.hypot(x, y))
-        return {"heading.mount_rpy_deg": [0.0, math.degrees(pitch), math.degrees(yaw)]}
+        return {
+            "heading.mount_rpy_deg": [0.0, math.degrees(pitch), math.degrees(yaw)],
+            "heading.offset_std_deg": 0.0,
+        }
 
     def measure(
         self, section: Section, episodes: Sequence[Episode], seed: np.random.SeedSequence

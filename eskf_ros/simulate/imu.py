@@ -122,6 +122,16 @@ def ideal_interval_means(
     return force, rate
 
 
+def vibration(speed: Array, std: float, stream: np.random.Generator) -> Array:
+    """Return what the road adds to a signal (n, 3): ``std`` (unit of the signal) at 10 m/s, like the root of the speed.
+
+    ``speed`` (n,) in m/s at the samples. The body shakes about where it is: sample by sample the velocity, or the
+    angle, jumps by a random amount and back, so that the sum of what is added never grows.
+    """
+    jump = stream.standard_normal((len(speed), 3)) * (std * np.sqrt(0.05 * speed))[:, None]
+    return np.diff(jump, axis=0, prepend=np.zeros((1, 3)))
+
+
 @dataclass(frozen=True)
 class SensorErrors:
     """Error model of one three-axis sensor, in the unit of its signal (rad/s or m/s2).

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -51,11 +51,9 @@ def topics_of(recording: Recording) -> list[Topic]:
     """Return the topics ``imu/data``, ``gps/fix``, ``gps/vel`` and ``truth`` of a recording, then those of its aids."""
     topics = [
         Topic("imu/data", "sensor_msgs/msg/Imu", recording.imu_arrival, partial(_imu, recording)),
-        *_gnss("gps", Frame.GNSS, recording),
+        *_gnss(recording),
         Topic("truth", "nav_msgs/msg/Odometry", recording.truth_stamp, partial(_truth, recording)),
     ]
-    if recording.second_gnss:
-        topics += _gnss("gps2", Frame.SECOND_GNSS, recording.second_gnss)
     for aid, (name, type_name, messages) in _AIDS.items():
         measured = getattr(recording, aid)
         if measured:
@@ -73,12 +71,27 @@ def _ranges(measured: RangeMeasurements) -> list[Topic]:
     return topics
 
 
-def _gnss(name: str, frame: Frame, gnss: GnssMeasurements) -> list[Topic]:
-    velocity_type = "geometry_msgs/msg/TwistWithCovarianceStamped"
-    return [
-        Topic(f"{name}/fix", "sensor_msgs/msg/NavSatFix", gnss.fix_arrival, partial(_fixes, gnss, frame)),
-        Topic(f"{name}/vel", velocity_type, gnss.velocity_arrival, partial(_velocities, gnss, frame)),
-    ]
+def _gnss(recording: Recording) -> list[Topic]:
+    """The topics of the GNSS receivers: two of them share both, and differ by the frame."""
+    fix_type, velocity_type = "sensor_msgs/msg/NavSatFix", "geometry_msgs/msg/TwistWithCovarianceStamped"
+    receivers: list[tuple[GnssMeasurements, Frame]] = [(recording, Frame.GNSS)]
+    if recording.second_gnss:
+        receivers.append((recording.second_gnss, Frame.SECOND_GNSS))
+    fixes = [(gnss.fix_arrival, partial(_fixes, gnss, frame)) for gnss, frame in receivers]
+    velocities = [(gnss.velocity_arrival, partial(_velocities, gnss, frame)) for gnss, frame in receivers]
+    return [_shared("gps/fix", fix_type, fixes), _shared("gps/vel", velocity_type, velocities)]
+
+
+def _shared(
+    name: str, type_name: str, senders: Sequence[tuple[NDArray[np.int64], Callable[[slice], NDArray[Any]]]]
+) -> Topic:
+    """One topic of several senders, in the order of arrival."""
+    if len(senders) == 1:
+        return Topic(name, type_name, *senders[0])
+    arrival = np.concatenate([times for times, _ in senders])
+    order = np.argsort(arrival, kind="stable")
+    messages = np.concatenate([made(slice(None)) for _, made in senders])[order]
+    return Topic(name, type_name, arrival[order], lambda part: messages[part])
 
 
 def _imu(recording: Recording, part: slice) -> NDArray[Any]:

@@ -71,7 +71,8 @@ class Options:
     ``imu_rpy_deg``: pose of the IMU in base_link. ``imu_interval_mean``: see `eskf_ros.simulate.imu`. Scale factor
     errors (standard deviation, 1) and quanta (rad/s, m/s2) of the IMU are off by default. ``gyro_offset`` (rad/s) and
     ``accel_offset`` (m/s2), in IMU axes, are added to the biases, and with ``gravity_removed`` the specific force is
-    given without gravity: faults the estimator is told nothing about.
+    given without gravity: faults the estimator is told nothing about. ``vibration``: what a road does to specific force
+    (m/s2) and angular rate (rad/s) at 10 m/s, see `eskf_ros.simulate.imu.vibration`.
 
     ``lever_arm``, ``gnss_rate``, ``position_std``, ``velocity_std``, ``latency``: the first GNSS receiver, see
     `eskf_ros.simulate.gnss.GnssReceiver`. The sensors that are None are not there; ``ranges`` are those of the first
@@ -102,6 +103,7 @@ class Options:
     gyro_offset: Vector = (0.0, 0.0, 0.0)
     accel_offset: Vector = (0.0, 0.0, 0.0)
     gravity_removed: bool = False
+    vibration: tuple[float, float] = (0.0, 0.0)
     second_gnss: GnssReceiver | None = None
     dual_antenna: DualAntenna | None = None
     wheel: WheelOdometer | None = None

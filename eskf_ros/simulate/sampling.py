@@ -36,6 +36,7 @@ class RandomStream(IntEnum):
     BODY_VELOCITY = 8
     SECOND_GNSS = 9
     RANGES = 10
+    VIBRATION = 11
 
 
 @dataclass(frozen=True)

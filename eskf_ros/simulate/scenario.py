@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 
 from eskf_ros.simulate.episodes import Outage, outages_of
 from eskf_ros.simulate.gnss import GnssStreams
-from eskf_ros.simulate.imu import ImuMount, SensorErrors, grade_parameters, ideal_interval_means, ideal_samples
+from eskf_ros.simulate.imu import (
+    ImuMount,
+    SensorErrors,
+    grade_parameters,
+    ideal_interval_means,
+    ideal_samples,
+    vibration,
+)
 from eskf_ros.simulate.map_frame import MapFrame
 from eskf_ros.simulate.recording import AIDS, Options, Recording
 from eskf_ros.simulate.sampling import (
@@ -67,6 +74,11 @@ def simulate(name: str, seed: int = 0, **options: Any) -> Recording:
     specific_force, accel_bias = accelerometer.apply(
         ideal.specific_force, chosen.imu_rate, seed_of(seed, RandomStream.ACCELEROMETER)
     )
+    if any(chosen.vibration):
+        speed = np.interp(ideal.imu_stamp, ideal.truth_stamp, np.linalg.norm(ideal.truth_velocity_map, axis=1))
+        streams = generators(seed_of(seed, RandomStream.VIBRATION), 2)
+        specific_force += vibration(speed, chosen.vibration[0], streams[0])
+        angular_rate += vibration(speed, chosen.vibration[1], streams[1])
     imu_delay, *gnss_delays = generators(seed_of(seed, RandomStream.ARRIVAL), 3)
     gnss_streams = GnssStreams(*generators(seed_of(seed, RandomStream.GNSS), 3), *gnss_delays)
     aids = {

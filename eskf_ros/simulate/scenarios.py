@@ -72,6 +72,7 @@ _CITY_LAP: tuple[Instruction, ...] = (
 )
 
 TUNNEL_START = 162.0
+PARKED = 147.0
 """Seconds from time zero."""
 
 _TUNNEL: tuple[Instruction, ...] = (
@@ -254,6 +255,12 @@ SCENARIOS: dict[str, Scenario] = {
         _drive((Hold(20.0), *_CITY_LAP, *_TUNNEL), side_slip=SIDE_SLIP_PER_ACCELERATION),
         heading_deg=-130.0,
         outages=((TUNNEL_START, TUNNEL_START + 300.0),),
+    ),
+    "garage": Scenario(
+        "a city lap, then ten minutes parked in a garage",
+        _drive((Hold(20.0), *_CITY_LAP, Hold(600.0))),
+        heading_deg=50.0,
+        outages=((PARKED, PARKED + 600.0),),
     ),
     "reverse_start": Scenario(
         "a car backs out of its place before it drives",

@@ -16,6 +16,7 @@ from eskf_ros.gnss.ephemeris_cloud import write_ephemerides
 from eskf_ros.gnss.point_solution import PointSolution, SolutionStatus, solve
 from eskf_ros.gnss.ranges import SATELLITE_KNOWN, locate, one_per_satellite
 from eskf_ros.gnss.signals import Gnss
+from eskf_ros.ranges.intake import DEFAULT_KLOBUCHAR
 from recordings.common import GNSS_FRAME, STATUS_FIX, Array, Fixes, Messages, ecef_to_geodetic_deg, nanoseconds
 
 
@@ -56,7 +57,7 @@ def gnss_ephemerides(
 
 
 def point_solutions(
-    epochs: RangeEpochs, ephemerides: Ephemerides, klobuchar: Array | None = None
+    epochs: RangeEpochs, ephemerides: Ephemerides, klobuchar: Array = DEFAULT_KLOBUCHAR
 ) -> Iterator[PointSolution]:
     """Our own point solution of each epoch, one signal per satellite."""
     for seconds, ranges in zip(epochs.seconds.tolist(), epochs.ranges, strict=True):
@@ -66,7 +67,7 @@ def point_solutions(
 
 
 def solved_fixes(
-    epochs: RangeEpochs, ephemerides: Ephemerides, klobuchar: Array | None = None
+    epochs: RangeEpochs, ephemerides: Ephemerides, klobuchar: Array = DEFAULT_KLOBUCHAR
 ) -> tuple[Fixes, Array, Array, Array]:
     """Fixes of the epochs that could be solved; time (m,), velocity (m, 3) and its deviations (m, 3) of the others."""
     times, positions, covariances, velocity_times, velocities, deviations = [], [], [], [], [], []

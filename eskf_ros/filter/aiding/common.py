@@ -12,10 +12,11 @@ from eskf_ros.rotation import cross, dot, rotate, rotate_back, to_matrix
 
 @njit
 def clear(work):
-    """Zero Jacobian and noise."""
+    """Zero Jacobian and noise, and what the noise shares with the errors."""
     for i in range(3):
         for j in range(ERROR_CAPACITY):
             work.jacobian[i, j] = 0.0
+            work.shared[i, j] = 0.0
         for j in range(3):
             work.noise[i, j] = 0.0
 

@@ -5,6 +5,8 @@ place where it is, and their covariance (rad2) in the first two axes; either may
 East-North-Up, yaw = atan2(d_n, d_e) and pitch = atan2(-d_u, |d_e, d_n|); a small rotation theta about local axes adds
 theta x d to d.
 
+What all yaws are wrong by alike, mounting and slow multipath, is an optional state: measured = yaw + offset.
+
 The line of source 1 is the x axis of base_link: what an IMU with a filter of its own says of it, perhaps from magnetic
 north. It serves at start only (``heading_hints``).
 """
@@ -16,6 +18,7 @@ import math
 from eskf_ros.compiled import njit
 from eskf_ros.filter.aiding.common import azimuth_change, clear, set_attitude_row, to_local
 from eskf_ros.filter.aiding.gnss_velocity import local_east_north_up_to_ecef
+from eskf_ros.filter.layout import ERROR_SIZE
 from eskf_ros.rotation import wrapped
 
 IMU_ORIENTATION = 1
@@ -50,6 +53,10 @@ def linearize(state, payload, source, settings, work):
     level = math.sqrt(level_square)
     size = 0
     if payload[3] > 0.0:
+        place = settings.heading_offset_at
+        if source == 0 and place < state.error_size:
+            yaw -= state.optional[place - ERROR_SIZE]
+            work.jacobian[0, place] = 1.0
         work.innovation[0] = wrapped(yaw - math.atan2(d[1], d[0]))
         set_attitude_row(work.jacobian, 0, state, local_to_ecef, azimuth_change(d, level_square))
         work.noise[0, 0] = payload[3]
