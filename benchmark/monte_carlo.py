@@ -41,6 +41,10 @@ Array = NDArray[np.float64]
 NO_SIDE_SLIP: dict[str, Any] = {"alignment.course_std_deg": 0.1}
 """The simulated car points where it drives: the estimator is told so, as it is told the noise of the sensors."""
 
+NO_REST: dict[str, Any] = {"zupt.enabled": False}
+"""The simulated car stands without swaying by a micrometre: an estimator that holds it at rest, within what springs do,
+is better than it says, and its statistics say nothing of the navigation."""
+
 BLOCKS: dict[str, slice] = {
     "position": slice(POSITION, POSITION + 3),
     "velocity": slice(VELOCITY, VELOCITY + 3),
@@ -218,7 +222,7 @@ def ensemble(
     runs = []
     for seed in seeds:
         recording = simulate(name, seed, **options)
-        parameters: Parameters = from_mapping({**recording.parameters(), **NO_SIDE_SLIP, **(changes or {})})
+        parameters: Parameters = from_mapping({**recording.parameters(), **NO_SIDE_SLIP, **NO_REST, **(changes or {})})
         runs.append(run(recording, Navigator(parameters), interval))
         progress(len(runs))
     # From the moment on at which the last of the runs is aligned.

@@ -742,7 +742,7 @@ class Ranges(Aid):
 @dataclass(frozen=True)
 class Zupt:
     enabled: bool = _parameter(
-        False,
+        True,
         "",
         "While the vehicle stands still, hold velocity and turn rate at zero. Wheels, GNSS and the spread of the IMU's "
         "readings tell when it does.",

@@ -27,6 +27,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "benchmark"))
 
 from monte_carlo import (
     BLOCKS,
+    NO_REST,
     NO_SIDE_SLIP,
     Ensemble,
     ensemble,
@@ -231,7 +232,7 @@ def test_a_gain_frozen_after_convergence_is_worse_through_a_tunnel_and_after_it(
     for seed in range(8):
         # Without latency the two see the same: the opponent works in the order of stamps.
         recording = simulate("drive", seed, outages=(tunnel,), latency=(0.0, 0.0))
-        parameters = from_mapping({**recording.parameters(), **NO_SIDE_SLIP})
+        parameters = from_mapping({**recording.parameters(), **NO_SIDE_SLIP, **NO_REST})
         estimator = navigator.Navigator(parameters)
         frozen = None
         stops = np.arange(round(frozen_at * 200) - 1, len(recording.imu_stamp), 1000)

@@ -4,10 +4,12 @@ A MEMS IMU at 50 Hz, wheel pulses at 50 Hz, an u-blox F9P with RTK and Doppler v
 
 Clocks, by correlation, fixed once:
 
-- GNSS time is 17.88 s (+-0.01) ahead of the IMU: smallest median difference between yaw rate and change of the course
-  of the Doppler velocity above 3 m/s. GNSS stamps are UTC (leap seconds 18), so they are 0.12 s early.
+- GNSS time is 17.985 s (+-0.015) ahead of the IMU: changes of the RTK and of the Doppler speed over two seconds against
+  the integral of the forward acceleration (17.99 and 18.02), and what the estimator's monitor of the time offset says.
+  GNSS stamps are UTC (leap seconds 18), so they are 0.015 s early. The yaw rate says 17.88 against the course of the
+  Doppler velocity; with that, positions are twice as far off and the monitor says so.
 - It is 17.34 s (+-0.02) ahead of the wheel speed: smallest median difference to the Doppler speed. The wheel speed is
-  0.54 s older than the IMU sample of the same row. 5.09 pulses are a metre. The speed has steps of 0.2 m/s; they last
+  0.645 s older than the IMU sample of the same row. 5.09 pulses are a metre. The speed has steps of 0.2 m/s; they last
   longer than 20 ms, and one sample in five is given.
 
 Axes: IMU x right, y forward, z up, found by the accelerations along the course and the sign of the turns. Over 5 m/s
@@ -68,8 +70,8 @@ from recordings.satellites import RangeEpochs, gnss_ephemerides, gnss_ranges, so
 
 WEEK = 2130
 LEAP_SECONDS = 18
-TIME_OFFSET = 0.12
-WHEEL_AGE = 0.54
+TIME_OFFSET = 0.015
+WHEEL_AGE = 0.645
 PULSES_PER_METRE = 5.09
 WHEEL_STD = 0.1
 VELOCITY_STD = (0.15, 0.15, 0.3)
