@@ -166,7 +166,7 @@ def main() -> int:
                 faults += sum(bool(navigator.complaints) or navigator.position_resets > 0 for _, _, navigator in done)
         content += f"\n### {title[0].upper() + title[1:]}\n\n" + table(HEADINGS, rows)
     if options.only:
-        return 0
+        return 1 if faults else 0
     rows = []
     for grade in GRADES:
         row = [grade]

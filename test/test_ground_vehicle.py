@@ -50,7 +50,7 @@ def moving(seed: int, settings: Any = SETTINGS) -> Any:
     if state["error_size"] > ERROR_SIZE:
         state["optional"][:3] = rng.normal(0.0, (0.1, 0.1, 0.05))
     state["block_end"] = state["stamp"]
-    state["block_count"] = 100
+    state["block_count"], state["block_half_count"] = 100, 50
     state["block_sum"][:3] = 100 * state["specific_force"]
     return state
 
@@ -239,7 +239,7 @@ def test_the_constraint_does_not_hold(missing: str) -> None:
     if missing == "block":
         state["block_end"] += 10**9
     elif missing == "samples":
-        state["block_count"] = 2
+        state["block_count"], state["block_half_count"] = 2, 1
     elif missing == "gap":
         state["block_broken"] = 1
     else:

@@ -215,3 +215,12 @@ def test_a_filter_that_is_lost_altogether_starts_again() -> None:
     assert Status.DEGRADED in statuses
     assert np.linalg.norm(error[:2]) < 3.0
     assert abs(error[8]) < 0.1
+
+
+def test_a_few_bad_fixes_after_a_long_outage_do_not_start_the_alignment_again() -> None:
+    """The minute that fixes have to come in vain does not begin with the outage."""
+    episodes = (Outage(BEGIN, 65.0), Multipath(BEGIN + 65.0, 1.6, (500.0, 0.0, 0.0)))
+    outcome, done, navigator = run_case(Case("away", 66.6, episodes, {"gnss_rate": 5.0}), 1)
+    assert np.count_nonzero(verdicts_of(done, BEGIN + 65.0) == Verdict.GATE) > 5
+    assert navigator.restarts == 0
+    assert outcome.recovery < 3.0

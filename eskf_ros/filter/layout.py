@@ -286,10 +286,12 @@ STATE = np.dtype(
         ("field_found", "f8", (2,)),
         ("disturbed_fields", "f8"),
         ("fields", "f8"),
-        # When absolute aids were last accepted, how many were rejected since, and how often that ended in a restart.
+        # When absolute aids were last accepted, how many were rejected since and from when on, and how often that ended
+        # in a restart.
         ("absolute_stamp", "i8"),
         ("absolute_interval", "i8"),
         ("rejected_fixes", "i8"),
+        ("rejected_since", "i8"),
         ("restarts", "i8"),
         # Monitors of the GNSS receivers (see ``aid_monitors``): effect of faults on the state so far, normal equations;
         # sums of innovations up and down on two axes; counts, means, sums.
@@ -541,6 +543,7 @@ WORK = np.dtype(
         ("shared", "f8", (3, ERROR_CAPACITY)),
         ("projected", "f8", (3, ERROR_CAPACITY)),
         ("innovation_covariance", "f8", (3, 3)),
+        ("noise_seen", "f8", (3, 3)),
         ("gain", "f8", (ERROR_CAPACITY, 3)),
         ("residual_gain", "f8", (ERROR_CAPACITY, 3)),
         ("correction", "f8", (ERROR_CAPACITY,)),

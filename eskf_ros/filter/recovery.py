@@ -193,6 +193,8 @@ def note(state, stream, source, verdict):
     else:
         state.aid_rejected[stream, source] += 1
         if stream in (GNSS_POSITION, PSEUDORANGE):
+            if state.rejected_fixes == 0:
+                state.rejected_since = state.stamp
             state.rejected_fixes += 1
         if stream == GNSS_POSITION:
             if verdict == CONTRADICTED:
@@ -277,7 +279,7 @@ def is_lost(state):
     is_new = state.restarts > 0 and state.stamp - state.first_stamp < RESTART_HELPS
     if state.recent_resets >= RESETS:
         return not is_new
-    since = max(state.absolute_stamp, state.first_stamp)
+    since = state.rejected_since
     for source in range(SOURCES):
         since = max(since, state.aid_fused_stamp[GNSS_VELOCITY, source])
     return state.rejected_fixes >= MEMBERS and state.stamp - since >= LAST_RESORT

@@ -23,7 +23,8 @@ def update(state, size, gate, work):
     Returns the verdict and the normalised innovation squared; the state changes only when the verdict is fused.
     ``gate`` is the largest normalised innovation squared that is accepted. Joseph form with the full product
     (I - K H) P (I - K H)' + K R K' (Groves, eq. 3.58), evaluated through its rank-``size`` parts, and extended by the
-    covariance C of noise and errors (Brown and Hwang, Introduction to Random Signals, section 5.5).
+    covariance C of noise and errors (Brown and Hwang, Introduction to Random Signals, section 5.5). The inverse of the
+    innovation covariance stays in ``work.innovation_covariance``.
     """
     project(state, size, work)
     if not invert_positive(work.innovation_covariance, size):
@@ -109,16 +110,16 @@ def joseph(state, size, work):
     # ``covariance`` is (I - K H) P - K C' now. All that is missing is (this H' - K R + C - K H C) K'.
     for a in range(size):
         for b in range(size):
-            work.innovation_covariance[a, b] = work.noise[a, b]
+            work.noise_seen[a, b] = work.noise[a, b]
             for j in range(n):
-                work.innovation_covariance[a, b] += work.jacobian[a, j] * work.shared[b, j]
+                work.noise_seen[a, b] += work.jacobian[a, j] * work.shared[b, j]
     for i in range(n):
         for a in range(size):
             total = work.shared[a, i]
             for j in range(n):
                 total += covariance[i, j] * work.jacobian[a, j]
             for b in range(size):
-                total -= gain[i, b] * work.innovation_covariance[b, a]
+                total -= gain[i, b] * work.noise_seen[b, a]
             work.residual_gain[i, a] = total
     for i in range(n):
         for j in range(i + 1):
