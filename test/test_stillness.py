@@ -146,6 +146,18 @@ def test_how_quiet_rest_is_is_learnt_where_it_is_seen() -> None:
         assert seen[f"{other}_level"] == 0.0
 
 
+def test_what_comes_before_motion_does_not_spoil_what_rest_is() -> None:
+    """Wheels read zero until the car moves at half a metre per second: six seconds of that, twenty times as loud."""
+    state = make_state()
+    state["resting_level"] = 0.01
+    for second in range(6):
+        state["block_end"] = state["resting_stamp"] = (10 + second) * CONSTRAINT_INTERVAL
+        state["block_count"], state["block_half_count"] = 100, 50
+        state["block_square_sum"][0] = 100 * 0.2 * SETTINGS["still_accel_std"] ** 2
+        learn_from_block(state, SETTINGS)
+    assert 0.01 < state["resting_level"] < 0.02
+
+
 # ---------------------------------------------------------------------------------------------------------- no rest
 
 

@@ -68,6 +68,9 @@ LEARNING = 0.1
 FORGETTING = 0.002
 """How quickly the level of rest follows, and that of the quietest motion rises again, per grid interval."""
 
+LOUDEST = 2.0
+"""Rest that is louder counts as so many times the level learnt: it may be the moment before the wheels turn."""
+
 PLAINLY_LESS_QUIET = 9.0
 """With three times the deviations motion cannot be taken for rest."""
 
@@ -186,7 +189,7 @@ def learn_from_block(state, settings):
     elif rested and state.resting_level == 0.0:
         state.resting_level = level
     elif rested:
-        state.resting_level += LEARNING * (level - state.resting_level)
+        state.resting_level += LEARNING * (min(level, LOUDEST * state.resting_level) - state.resting_level)
 
 
 @njit
