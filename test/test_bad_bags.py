@@ -260,7 +260,7 @@ def test_results_that_cannot_be_written(command: Command, tmp_path: Path) -> Non
 
 
 def test_json_that_cannot_be_written(command: Command, tmp_path: Path) -> None:
-    code, _, error = command(BAG, "--quiet", "--json", tmp_path / "nowhere" / "summary.json")
+    code, _, error = command(BAG, "--config", CONFIG, "--quiet", "--json", tmp_path / "nowhere" / "summary.json")
     assert code == 2
     assert "--json" in error
     assert error.count("\n") == 1
@@ -275,7 +275,7 @@ def test_two_recordings_of_one_name(command: Command, tmp_path: Path) -> None:
 
 def test_one_bad_recording_does_not_stop_the_others(command: Command, tmp_path: Path) -> None:
     (tmp_path / "bad.mcap").write_bytes(b"nothing")
-    code, _, error = command(tmp_path / "bad.mcap", BAG, "--quiet")
+    code, _, error = command(tmp_path / "bad.mcap", BAG, "--config", CONFIG, "--quiet")
     assert code == 2
     assert error.count("\n") == 1
     assert (tmp_path / "out" / "tunnel_drive_eskf" / "summary.json").exists()

@@ -538,3 +538,30 @@ def test_services_of_robot_localization_answer(drive, monkeypatch):
     assert navigator.datum == pytest.approx((place.latitude, place.longitude, place.altitude))
     services.call("datum", SimpleNamespace())
     assert "AttributeError" in services.said[-1]
+
+
+@needs_ros
+@pytest.mark.parametrize("use", ["unused", "true_north"])
+def test_the_orientation_of_the_imu_tells_the_heading_if_asked_to(make, start, use):
+    """A parked robot knows which way it stands; nobody asks an IMU that was not named as a source."""
+    inside = make("-p", f"alignment.imu_orientation:={use}")
+    yaw = math.radians(70.0)
+
+    def oriented(messages: Any) -> None:
+        messages["orientation"] = (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
+        messages["orientation_covariance"] = 0.0
+
+    inside.play(
+        [(t, topic, changed(topic, data, oriented) if topic == "imu/data" else data) for t, topic, data in start]
+    )
+    row = inside.node.navigator.odometry[0]
+    assert bool(row["heading_known"]) == (use == "true_north")
+    if use == "true_north":
+        w, x, y, z = row["attitude_body_to_map"]
+        found = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        # The x axis of base_link, as the IMU, mounted askew, says it points.
+        x, y, _ = inside.node.navigator._settings["imu_to_base"][0, 0]
+        told = yaw + math.atan2(y, x)
+        std = math.sqrt(row["pose_covariance"][5, 5])
+        assert std < math.radians(15.0)
+        assert abs(math.remainder(found - told, math.tau)) < 3.0 * std

@@ -21,7 +21,7 @@ from std_srvs.srv import Trigger
 
 from eskf_ros.compiled import while_compiling
 from eskf_ros.filter.layout import ODOMETRY, STREAM_NAMES, Status, Stream, Verdict, allocate
-from eskf_ros.filter.navigator import Navigator, compile_kernels
+from eskf_ros.filter.navigator import ORIENTATION_SHARE, Navigator, compile_kernels
 from eskf_ros.filter.warm_start import Memory
 from eskf_ros.gnss.rinex import RinexError
 from eskf_ros.inputs import Input, uses_ranges
@@ -223,6 +223,8 @@ class EskfNode(Node):
             return
         if self._memory is not None:
             self._offer_memory(stamp)
+        if self.parameters.alignment.imu_orientation != "unused" and stamp % SECOND < ORIENTATION_SHARE:
+            self._push_orientation(stamp, deserialize_message(data, Imu))
         rows = self.navigator.push_imu(np.array([stamp]), np.array([specific_force]), np.array([angular_rate]))
         for index in range(len(rows)):
             self.outputs.publish(rows, index)
@@ -243,6 +245,11 @@ class EskfNode(Node):
             return RangeIntake(self.navigator, self.parameters)
         except RinexError as error:
             raise ParameterError("ranges.rinex_nav_files", [str(error)]) from error
+
+    def _push_orientation(self, stamp: int, message: Imu) -> None:
+        q = message.orientation
+        covariance = np.reshape(message.orientation_covariance, (1, 9))
+        self.navigator.push_imu_orientation(np.array([stamp]), np.array([[q.x, q.y, q.z, q.w]]), covariance)
 
     def _on_aid(self, source: AidInput, push: Callable[..., Any], data: bytes) -> None:
         arrival = self.now()
