@@ -146,9 +146,9 @@ def test_a_velocity_without_covariance_takes_the_stand_in() -> None:
     assert not np.any(arguments[2])
     navigator = Navigator(from_mapping({"gnss.unknown_velocity_std": 0.7}))
     kind.push_of(navigator)(*arguments)
-    offered = navigator._offered[0]
-    assert offered["door"] == Verdict.WAITING
-    assert offered["payload"][[3, 6, 8]].tolist() == [0.7**2] * 3
+    (waiting,) = navigator.finish()
+    assert waiting["verdict"] == Verdict.WAITING
+    assert navigator._offered[0]["payload"][[3, 6, 8]].tolist() == [0.7**2] * 3
 
 
 @needs_ros

@@ -20,15 +20,14 @@ ABSENT = -1.0
 
 @njit
 def admit(offered, values, covariance, stand_in, scale, std_floor, may_lack_axes):
-    """Write three values and the conditioned covariance to the payload of the record on offer; open or shut its door.
+    """Write three values and the conditioned covariance to the payload of the record on offer; return its door.
 
     ``covariance`` row-major 3x3, in the unit of the values squared; when ``stand_in`` has a positive first element it
     is the diagonal used instead. Scaled, then lifted to the floor (one for each axis): raising the diagonal of a
     positive semidefinite matrix keeps it one. An axis that may lack and whose variance is negative or no number was
     not measured: its value becomes 0 and its variance -1.
     """
-    aid = offered[0]
-    payload = aid.payload
+    payload = offered[0].payload
     for i in range(3):
         payload[i] = values[i]
     for i in range(3, len(payload)):
@@ -50,8 +49,7 @@ def admit(offered, values, covariance, stand_in, scale, std_floor, may_lack_axes
         lacking = take_out_absent_axes(payload)
     for i in range(9):
         if not math.isfinite(payload[i]):
-            aid.door = NON_FINITE
-            return
+            return NON_FINITE
     lowest = min(payload[3], payload[6], payload[8])
     for i in range(3, 9):
         payload[i] *= scale
@@ -61,12 +59,12 @@ def admit(offered, values, covariance, stand_in, scale, std_floor, may_lack_axes
     xx, xy, xz = payload[3], payload[4], payload[5]
     yy, yz, zz = payload[6], payload[7], payload[8]
     determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
-    aid.door = OPEN
-    if lowest < 0.0 or not (xx * yy - xy * xy > 0.0 and determinant > 0.0) or lacking == 7:
-        aid.door = BAD_COVARIANCE
     for i in range(3):
         if lacking & (1 << i):
             payload[VARIANCES[i]] = ABSENT
+    if lowest < 0.0 or not (xx * yy - xy * xy > 0.0 and determinant > 0.0) or lacking == 7:
+        return BAD_COVARIANCE
+    return OPEN
 
 
 @njit

@@ -72,8 +72,8 @@ from eskf_ros.filter.timeline import (
     CHECKPOINT_SPACING,
     doubled,
     forget,
-    insert_aid,
     insert_imu,
+    offer_aid,
     open_record,
     raise_barrier,
     rewind,
@@ -109,6 +109,9 @@ BARO = int(Stream.BARO)
 OPEN_DOOR = int(Verdict.WAITING)
 FIRST_CONSTRAINT = int(min(CONSTRAINTS))
 FUSED = int(Verdict.FUSED)
+NO_FIX = int(Verdict.NO_FIX)
+BAD_VALUE = int(Verdict.BAD_VALUE)
+DISABLED = int(Verdict.DISABLED)
 GATE = int(Verdict.GATE)
 BEFORE_ALIGNMENT = int(Verdict.BEFORE_ALIGNMENT)
 INACTIVE = int(Verdict.INACTIVE)
@@ -356,6 +359,7 @@ class Navigator:
         """Use other parameters from now on; history within the window is judged by them when it is applied again."""
         self.parameters = parameters
         self._settings = settings_from(parameters, self._output_rate)
+        self._constraint_count = int(self._settings["constrains"].sum())
         self._intakes = intakes_from(parameters)
         self._needs_field = parameters.mag.use or parameters.alignment.imu_orientation == "magnetic_north"
         if self._memory is not None:
@@ -508,16 +512,15 @@ class Navigator:
             horizontal, vertical = gnss.status_std_horizontal[level] ** 2, gnss.status_std_vertical[level] ** 2
             stand_in = (horizontal, horizontal, vertical)
         values = (math.radians(latitude_deg), math.radians(longitude_deg), float(altitude))
-        aid = self._admit(Stream.GNSS_POSITION, values, matrix, stand_in)
-        if aid["door"] == Verdict.WAITING and status < 0:
-            aid["door"] = Verdict.NO_FIX
-        elif aid["door"] == Verdict.WAITING and (
-            abs(latitude_deg) > 90.0 or abs(longitude_deg) > 360.0 or abs(altitude) > HIGHEST_ALTITUDE
-        ):
-            aid["door"] = Verdict.BAD_VALUE
-        elif aid["door"] == Verdict.WAITING and self._needs_field:
-            self._add_field(latitude_deg, longitude_deg, altitude, stamp)
-        self._push_gnss(Stream.GNSS_POSITION, stamp, arrival, frame_id)
+        door = self._admit(Stream.GNSS_POSITION, values, matrix, stand_in)
+        if door == OPEN_DOOR:
+            if status < 0:
+                door = NO_FIX
+            elif abs(latitude_deg) > 90.0 or abs(longitude_deg) > 360.0 or abs(altitude) > HIGHEST_ALTITUDE:
+                door = BAD_VALUE
+            elif self._needs_field:
+                self._add_field(latitude_deg, longitude_deg, altitude, stamp)
+        self._push_gnss(Stream.GNSS_POSITION, stamp, arrival, frame_id, door)
 
     def push_gnss_velocity(
         self,
@@ -532,8 +535,8 @@ class Navigator:
         An all-zero or absent covariance (first number negative) becomes ``gnss.unknown_velocity_std``. ``frame_id``
         tells which antenna it is.
         """
-        self._take(Stream.GNSS_VELOCITY, velocity_enu, covariance)
-        self._push_gnss(Stream.GNSS_VELOCITY, stamp, arrival, frame_id)
+        door = self._take(Stream.GNSS_VELOCITY, velocity_enu, covariance)
+        self._push_gnss(Stream.GNSS_VELOCITY, stamp, arrival, frame_id, door)
 
     def push(
         self,
@@ -548,8 +551,8 @@ class Navigator:
         What the values are says the file of the aid in ``aiding``. An all-zero covariance takes the stand-in of the
         parameters; an axis with a negative variance was not measured.
         """
-        self._take(stream, values, covariance)
-        self._push_aid(stream, stamp + round(self._intakes[stream].time_offset * SECOND), arrival)
+        door = self._take(stream, values, covariance)
+        self._push_aid(stream, stamp + round(self._intakes[stream].time_offset * SECOND), arrival, 0, door)
 
     def push_ranges(
         self,
@@ -613,8 +616,8 @@ class Navigator:
                 yaw = math.atan2(forward[1], forward[0])
             std = math.radians(alignment.imu_orientation_std_deg)
             given = np.diag([covariance[i, 8], ABSENT, ABSENT]).ravel()
-            admit(self._offered, (yaw, 0.0, 0.0), given, NO_STAND_IN, 1.0, (std, std, std), True)
-            self._push_aid(Stream.HEADING, stamp, stamp, heading.IMU_ORIENTATION)
+            door = admit(self._offered, (yaw, 0.0, 0.0), given, NO_STAND_IN, 1.0, (std, std, std), True)
+            self._push_aid(Stream.HEADING, stamp, stamp, heading.IMU_ORIENTATION, door)
 
     def take_records(self) -> np.ndarray:
         """Return the records (RECORD) that became final since the last call: in the total order, the too late last."""
@@ -744,8 +747,8 @@ class Navigator:
         """Memory of the history buffers: grows with window and rates, not with time."""
         return sum(buffer.nbytes for buffer in (self._imu, self._aids, self._checkpoints, self._rows))
 
-    def _take(self, stream: Stream, values: Sequence[float], covariance: Sequence[float] | FloatArray) -> None:
-        """Fill the record that is on offer, with the stand-in where no covariance came; judge its payload."""
+    def _take(self, stream: Stream, values: Sequence[float], covariance: Sequence[float] | FloatArray) -> int:
+        """Fill the payload on offer, with the stand-in where no covariance came; return its door."""
         intake = self._intakes[stream]
         matrix = np.ascontiguousarray(covariance, np.float64)
         is_absent = not matrix.any() or (matrix[0] < 0.0 and not intake.may_lack_axes)
@@ -753,7 +756,7 @@ class Navigator:
             matrix = np.where((matrix > intake.largest_variance) & (DIAGONAL == 1.0), ABSENT, matrix)
         x, y, z = intake.unknown_std
         stand_in = (x * x, y * y, z * z) if is_absent else NO_STAND_IN
-        self._admit(stream, (float(values[0]), float(values[1]), float(values[2])), matrix, stand_in)
+        return self._admit(stream, (float(values[0]), float(values[1]), float(values[2])), matrix, stand_in)
 
     def _admit(
         self,
@@ -761,19 +764,20 @@ class Navigator:
         values: tuple[float, float, float],
         covariance: FloatArray,
         stand_in: tuple[float, float, float],
-    ) -> np.ndarray:
-        """Fill the record that is on offer, and judge its payload."""
+    ) -> int:
+        """Fill the payload on offer; return its door."""
         intake = self._intakes[stream]
         scale, floor, lacks = intake.covariance_scale, intake.std_floor, intake.may_lack_axes
-        admit(self._offered, values, covariance, stand_in, scale, floor, lacks)
-        aid = self._offered[0]
+        door = admit(self._offered, values, covariance, stand_in, scale, floor, lacks)
         if not intake.is_used:
-            aid["door"] = Verdict.DISABLED
-        elif aid["door"] == Verdict.WAITING and (max(map(abs, values)) > intake.largest or values[0] < intake.lowest):
-            aid["door"] = Verdict.BAD_VALUE
-        if aid["door"] == Verdict.WAITING and stand_in is not NO_STAND_IN:
+            return DISABLED
+        if door != OPEN_DOOR:
+            return int(door)
+        if max(map(abs, values)) > intake.largest or values[0] < intake.lowest:
+            return BAD_VALUE
+        if stand_in is not NO_STAND_IN:
             self._stand_ins += 1
-        return aid
+        return OPEN_DOOR
 
     def _add_field(self, latitude_deg: float, longitude_deg: float, altitude: float, stamp: int) -> None:
         """Write the Earth's magnetic field at a fix, a function of the fix alone, to the record that is on offer."""
@@ -789,26 +793,21 @@ class Navigator:
             declination = found
         self._offered[0]["payload"][mag.FIELD : mag.FIELD + 4] = (1.0, declination, inclination, strength)
 
-    def _push_gnss(self, stream: Stream, stamp: int, arrival: int, frame_id: str) -> None:
+    def _push_gnss(self, stream: Stream, stamp: int, arrival: int, frame_id: str, door: int) -> None:
         """Sort the record that is on offer into the timeline, as one of the receiver with this frame."""
         second = self.parameters.second_gnss
         is_second = second.frame_id != "" and frame_id == second.frame_id
         offset = second.time_offset if is_second else self.parameters.gnss.time_offset
         if self.parameters.mode == "tight" and not is_second:
             # The fix is made of the same ranges: both together would count twice.
-            self._offered[0]["door"] = Verdict.DISABLED
-        self._push_aid(stream, stamp + round(offset * SECOND), arrival, int(is_second))
+            door = DISABLED
+        self._push_aid(stream, stamp + round(offset * SECOND), arrival, int(is_second), door)
 
-    def _push_aid(self, stream: Stream, stamp: int, arrival: int, source: int = 0) -> None:
+    def _push_aid(self, stream: Stream, stamp: int, arrival: int, source: int, door: int) -> None:
         """Sort the record that is on offer into the timeline."""
         self._offered_count[stream] += 1
-        aid = self._offered[0]
-        aid["source"] = source
-        aid["stamp"], aid["arrival"], aid["stream"], aid["verdict"] = stamp, arrival, stream, aid["door"]
-        # So it stays in the record of a measurement that waits in vain.
-        aid["dof"], aid["nis"], aid["innovation"] = 0, math.nan, math.nan
         self._make_room()
-        refused = insert_aid(self._aids, self._timeline, self._offered)
+        refused = offer_aid(self._aids, self._timeline, self._offered, stamp, arrival, int(stream), source, door)
         if refused:
             self._refuse(stream, stamp, arrival, source, Verdict(refused))
 
@@ -840,7 +839,7 @@ class Navigator:
         timeline = self._timeline
         checkpoints_needed = IMU_BATCH // CHECKPOINT_SPACING + 2
         # An interval between two samples has room for one grid point of the constraints.
-        aids_needed = 1 + aids + IMU_BATCH * int(self._settings["constrains"].sum())
+        aids_needed = 1 + aids + IMU_BATCH * self._constraint_count
         if (
             len(self._imu) >= timeline["imu_count"][0] + IMU_BATCH
             and len(self._aids) >= timeline["aid_count"][0] + aids_needed

@@ -61,7 +61,7 @@ from eskf_ros.filter.layout import (
 from eskf_ros.filter.local import note_jump
 from eskf_ros.filter.optional import join, renew
 from eskf_ros.filter.recovery import note_epoch
-from eskf_ros.filter.timeline import insert_aid, open_record
+from eskf_ros.filter.timeline import offer_aid, open_record
 from eskf_ros.filter.update import invert_positive, project, update
 from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, Status
 from eskf_ros.gnss.signals import SPEED_OF_LIGHT
@@ -127,7 +127,7 @@ def offer_signals(aids, timeline, offered, signals, stamp, arrival, gps_time, kl
     ``gps_time``: s since 6 January 1980, ``klobuchar``: parameters of the ionosphere (8,). Returns how many never
     enter; ``refused`` (RECORD) says which and why.
     """
-    aid = offered[0]
+    payload = offered[0].payload
     count = 0
     for k in range(len(signals)):
         signal = signals[k]
@@ -137,11 +137,8 @@ def offer_signals(aids, timeline, offered, signals, stamp, arrival, gps_time, kl
             is_code = stream == PSEUDORANGE
             if not signal["flags"] & (CODE_VALID if is_code else DOPPLER_VALID):
                 continue
-            aid.stamp, aid.arrival, aid.stream = stamp, arrival, stream
-            aid.source = source_of(signal["gnss_id"], signal["sv_id"], signal["signal"])
-            aid.door = code_door if is_code else rate_door
-            aid.verdict, aid.told = aid.door, 0
-            payload = aid.payload
+            source = source_of(signal["gnss_id"], signal["sv_id"], signal["signal"])
+            door = code_door if is_code else rate_door
             payload[:] = 0.0
             payload[MEASURED] = signal["pseudorange"] if is_code else signal["range_rate"]
             payload[STD] = signal["code_std"] if is_code else signal["range_rate_std"]
@@ -153,15 +150,14 @@ def offer_signals(aids, timeline, offered, signals, stamp, arrival, gps_time, kl
             payload[CN0] = signal["cn0"]
             payload[NOISE_FACTOR] = signal["noise_factor"]
             payload[GPS_TIME] = gps_time
-            if aid.door == WAITING:
-                aid.door = judge_signal(payload)
-                aid.verdict = aid.door
+            if door == WAITING:
+                door = judge_signal(payload)
             payload[KLOBUCHAR : KLOBUCHAR + 8] = klobuchar
-            verdict = insert_aid(aids, timeline, offered)
+            verdict = offer_aid(aids, timeline, offered, stamp, arrival, stream, source, door)
             if verdict != WAITING:
                 record = refused[count]
                 record["stamp"], record["arrival"], record["stream"] = stamp, arrival, stream
-                record["source"], record["verdict"], record["dof"] = aid.source, verdict, 0
+                record["source"], record["verdict"], record["dof"] = source, verdict, 0
                 record["nis"] = math.nan
                 for i in range(3):
                     record["innovation"][i] = math.nan

@@ -270,6 +270,19 @@ def comes_before(a, b):
 
 
 @njit
+def offer_aid(aids, timeline, offered, stamp, arrival, stream, source, door):
+    """Head the record whose payload is on offer, and sort it into the buffer as `insert_aid` does."""
+    aid = offered[0]
+    aid.stamp, aid.arrival, aid.stream, aid.source = stamp, arrival, stream, source
+    aid.door, aid.verdict, aid.told = door, door, 0
+    # So it stays in the record of a measurement that waits in vain.
+    aid.dof, aid.nis = 0, math.nan
+    for k in range(3):
+        aid.innovation[k] = math.nan
+    return insert_aid(aids, timeline, offered)
+
+
+@njit
 def insert_aid(aids, timeline, offered):
     """Sort one offered measurement into the buffer, which has room; return the verdict when the door stays shut.
 

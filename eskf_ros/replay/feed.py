@@ -85,7 +85,7 @@ class Feed:
         for place, kind, arguments in self._offers(batch):
             push_imu_until(place)
             self._gnss_over = self._gnss_over or (self._ins_only and self._navigator.status >= Status.GOOD)
-            if kind.is_gnss and (self._gnss_over or self._in_outage(arguments[0])):
+            if kind.is_gnss and (self._gnss_over or (self._outages and self._in_outage(arguments[0]))):
                 self.withheld[kind.stream] += 1
             else:
                 self._pushes[kind.name](*arguments)
