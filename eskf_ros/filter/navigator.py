@@ -11,38 +11,21 @@ import numpy.typing as npt
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
-from eskf_ros.filter.aid_monitors import aid_complaints, watch_aid
-from eskf_ros.filter.aiding import (
-    baro,
-    body_velocity,
-    gnss_position,
-    gnss_velocity,
-    heading,
-    mag,
-    nhc,
-    wheel,
-    zaru,
-    zupt,
-)
+from eskf_ros.filter.aid_monitors import aid_complaints
+from eskf_ros.filter.aiding import heading, mag
 from eskf_ros.filter.alignment import (
     heading_of,
     level_again,
     move_datum,
-    note_position,
-    note_velocity,
     place,
-    recall_heading,
     restart,
-    search_heading,
     set_datum,
-    start_position,
     watch_stillness,
 )
 from eskf_ros.filter.door import ABSENT, admit
-from eskf_ros.filter.heading_hints import is_heading_told
+from eskf_ros.filter.fusion import fuse
 from eskf_ros.filter.layout import (
     AID,
-    CONSTRAINTS,
     IMU,
     LOCAL,
     NEVER,
@@ -59,13 +42,12 @@ from eskf_ros.filter.layout import (
     blank_state,
 )
 from eskf_ros.filter.local import carry, measure_step, note_jump
-from eskf_ros.filter.monitors import complaints, watch_course, watch_field, watch_heading
-from eskf_ros.filter.optional import join
+from eskf_ros.filter.monitors import complaints
 from eskf_ros.filter.output import status_of, write_odometry
 from eskf_ros.filter.ranges import end_of_epoch, fuse_ranges, is_range, offer_signals
-from eskf_ros.filter.recovery import gate_of, phase_of, recover, watch_solution
+from eskf_ros.filter.recovery import phase_of
 from eskf_ros.filter.settings import intakes_from, settings_from
-from eskf_ros.filter.stillness import add_to_block, note_evidence, watch_wheels
+from eskf_ros.filter.stillness import add_to_block
 from eskf_ros.filter.strapdown import SECOND, propagate
 from eskf_ros.filter.sway import add_to_part
 from eskf_ros.filter.timeline import (
@@ -74,16 +56,12 @@ from eskf_ros.filter.timeline import (
     forget,
     insert_imu,
     offer_aid,
-    open_record,
     raise_barrier,
     rewind,
     save_checkpoint,
     take_final,
 )
-from eskf_ros.filter.track import follow
-from eskf_ros.filter.update import update
 from eskf_ros.filter.warm_start import Memory, recall
-from eskf_ros.filter.wheel_heading import search_with_wheels
 from eskf_ros.gnss.measurements import MEASURED_SIGNAL
 from eskf_ros.gnss.range_model import NO_KLOBUCHAR
 from eskf_ros.gnss.ranges import Status as RangeStatus
@@ -96,24 +74,10 @@ from eskf_ros.rotation import to_matrix
 FloatArray = npt.NDArray[np.float64]
 StampArray = npt.NDArray[np.int64]
 
-GNSS_POSITION = int(Stream.GNSS_POSITION)
-GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
-WHEEL = int(Stream.WHEEL)
-BODY_VELOCITY = int(Stream.BODY_VELOCITY)
-ZUPT = int(Stream.ZUPT)
-ZARU = int(Stream.ZARU)
-NHC = int(Stream.NHC)
-HEADING = int(Stream.HEADING)
-MAG = int(Stream.MAG)
-BARO = int(Stream.BARO)
 OPEN_DOOR = int(Verdict.WAITING)
-FIRST_CONSTRAINT = int(min(CONSTRAINTS))
-FUSED = int(Verdict.FUSED)
 NO_FIX = int(Verdict.NO_FIX)
 BAD_VALUE = int(Verdict.BAD_VALUE)
 DISABLED = int(Verdict.DISABLED)
-GATE = int(Verdict.GATE)
-BEFORE_ALIGNMENT = int(Verdict.BEFORE_ALIGNMENT)
 INACTIVE = int(Verdict.INACTIVE)
 
 LONGEST_GAP = 5 * SECOND
@@ -214,119 +178,6 @@ def fuse_next(state, aids, count, settings, work):
     end = end_of_epoch(aids, i, count)
     fuse_ranges(state, aids, i, end, settings, work)
     return end
-
-
-@njit
-def fuse(state, aids, i, settings, work):
-    """Offer one measurement to the state and leave the verdict in its record."""
-    if not open_record(aids, i):
-        return
-    aid = aids[i]
-    if aid.stream == GNSS_POSITION:
-        note_position(state, aid, settings)
-    elif aid.stream == GNSS_VELOCITY:
-        note_velocity(state, aid, settings)
-        watch_course(state, aid, heading_of(state, settings), settings)
-    note_evidence(state, aid, settings)
-    if not is_aligned_for(state, aid.stream):
-        if aid.stream == WHEEL:
-            search_with_wheels(state, aid.payload, settings.gate[WHEEL, 2], settings, work)
-            watch_wheels(state, aid)
-        aid.verdict = BEFORE_ALIGNMENT if aid.stream < FIRST_CONSTRAINT else INACTIVE
-        return
-    if aid.stream == HEADING and aid.source == heading.IMU_ORIENTATION and state.heading_known == 1:
-        aid.verdict = INACTIVE
-        return
-    if state.position_known == 0 and aid.stream == GNSS_POSITION:
-        begin(state, aid, settings)
-    position = (state.position_map[0], state.position_map[1], state.position_map[2])
-    heading_before = heading_of(state, settings)
-    join(state, settings.reach[aid.stream], settings)
-    watch_solution(state, aid, settings)
-    if aid.stream == MAG:
-        mag.note_way(state, heading_before, settings)
-        is_disturbed = mag.is_disturbed(state, aid, settings)
-        watch_field(state, is_disturbed)
-        if is_disturbed:
-            aid.verdict = GATE
-            return
-    size = linearize(state, aid, settings, work)
-    if size == 0:
-        aid.verdict = INACTIVE
-        return
-    if aid.stream in (HEADING, MAG):
-        watch_heading(state, aid, work)
-        if state.heading_known == 0:
-            if not is_heading_told(state, aid, settings, work):
-                aid.verdict = BEFORE_ALIGNMENT
-                return
-            size = linearize(state, aid, settings, work)
-    for k in range(size):
-        aid.innovation[k] = work.innovation[k]
-    aid.dof = size
-    follow(state, aid, work)
-    gate = gate_of(state, aid, size, settings)
-    aid.verdict, aid.nis = update(state, size, gate, work)
-    recover(state, aid, size, gate, settings, work)
-    watch_aid(state, aid, size, gate, work, settings)
-    if aid.verdict == FUSED and state.heading_known == 0:
-        search_heading(state, aid, gate, settings, work)
-    if aid.stream == GNSS_POSITION:
-        mag.note_field(state, aid)
-    elif aid.stream == WHEEL:
-        watch_wheels(state, aid)
-    note_jump(state, position, heading_before, settings)
-
-
-@njit
-def begin(state, aid, settings):
-    """Take the position from the first fix, and the heading from memory if the robot is where it was left."""
-    position = (state.position_map[0], state.position_map[1], state.position_map[2])
-    heading_before = heading_of(state, settings)
-    start_position(state, aid.payload)
-    recall_heading(state, aid.payload, settings)
-    note_jump(state, position, heading_before, settings)
-
-
-@njit
-def is_aligned_for(state, stream):
-    """Say whether the start-up is far enough for a measurement of a stream."""
-    if state.level_known == 0:
-        return False
-    if stream == GNSS_POSITION:
-        return True
-    if stream in (GNSS_VELOCITY, HEADING, BARO):
-        return state.position_known == 1
-    if stream == MAG:
-        return state.position_known == 1 and state.field_known == 1
-    return state.position_known == 1 and state.heading_known == 1
-
-
-@njit
-def linearize(state, aid, settings, work):
-    """Write innovation, Jacobian and noise of one measurement to ``work``; return its size. The list of aids.
-
-    Size 0: the measurement says nothing in this state.
-    """
-    if aid.stream == GNSS_POSITION:
-        return gnss_position.linearize(state, aid.payload, aid.source, settings, work)
-    if aid.stream == WHEEL:
-        return wheel.linearize(state, aid.payload, settings, work)
-    if aid.stream == BODY_VELOCITY:
-        return body_velocity.linearize(state, aid.payload, settings, work)
-    if aid.stream == ZUPT:
-        return zupt.linearize(state, settings, work)
-    if aid.stream == ZARU:
-        return zaru.linearize(state, settings, work)
-    if aid.stream == NHC:
-        return nhc.linearize(state, settings, work)
-    if aid.stream == HEADING:
-        return heading.linearize(state, aid.payload, aid.source, settings, work)
-    if aid.stream == MAG:
-        return mag.linearize(state, aid.payload, settings, work)
-    if aid.stream == BARO:
-        return baro.linearize(state, aid.payload, aid.source, settings, work)
-    return gnss_velocity.linearize(state, aid.payload, aid.source, settings, work)
 
 
 @njit

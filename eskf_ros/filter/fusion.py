@@ -1,0 +1,192 @@
+"""One measurement on its way from the timeline to its verdict. ``linearize`` is the list of aids."""
+
+from __future__ import annotations
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.aid_monitors import watch_aid
+from eskf_ros.filter.aiding import (
+    baro,
+    body_velocity,
+    gnss_position,
+    gnss_velocity,
+    heading,
+    mag,
+    nhc,
+    wheel,
+    zaru,
+    zupt,
+)
+from eskf_ros.filter.alignment import (
+    heading_of,
+    note_position,
+    note_velocity,
+    recall_heading,
+    search_heading,
+    start_position,
+)
+from eskf_ros.filter.heading_hints import is_heading_told
+from eskf_ros.filter.layout import CONSTRAINTS, Stream, Verdict
+from eskf_ros.filter.local import note_jump
+from eskf_ros.filter.monitors import watch_course, watch_field, watch_heading
+from eskf_ros.filter.optional import join
+from eskf_ros.filter.recovery import gate_of, recover, watch_solution
+from eskf_ros.filter.stillness import note_evidence, watch_wheels
+from eskf_ros.filter.timeline import open_record
+from eskf_ros.filter.track import follow
+from eskf_ros.filter.update import update
+from eskf_ros.filter.wheel_heading import search_with_wheels
+
+GNSS_POSITION = int(Stream.GNSS_POSITION)
+GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
+WHEEL = int(Stream.WHEEL)
+BODY_VELOCITY = int(Stream.BODY_VELOCITY)
+ZUPT = int(Stream.ZUPT)
+ZARU = int(Stream.ZARU)
+NHC = int(Stream.NHC)
+HEADING = int(Stream.HEADING)
+MAG = int(Stream.MAG)
+BARO = int(Stream.BARO)
+FIRST_CONSTRAINT = int(min(CONSTRAINTS))
+FUSED = int(Verdict.FUSED)
+GATE = int(Verdict.GATE)
+BEFORE_ALIGNMENT = int(Verdict.BEFORE_ALIGNMENT)
+INACTIVE = int(Verdict.INACTIVE)
+
+
+@njit
+def fuse(state, aids, i, settings, work):
+    """Offer one measurement to the state and leave the verdict in its record."""
+    if not open_record(aids, i):
+        return
+    aid = aids[i]
+    take_evidence(state, aid, settings)
+    if not is_aligned_for(state, aid.stream):
+        wait_for_alignment(state, aid, settings, work)
+        return
+    if aid.stream == HEADING and aid.source == heading.IMU_ORIENTATION and state.heading_known == 1:
+        # It is made of the same IMU: good for a start, and nothing new afterwards.
+        aid.verdict = INACTIVE
+        return
+    if state.position_known == 0 and aid.stream == GNSS_POSITION:
+        begin(state, aid, settings)
+
+    position_before = (state.position_map[0], state.position_map[1], state.position_map[2])
+    heading_before = heading_of(state, settings)
+    join(state, settings.reach[aid.stream], settings)
+    watch_solution(state, aid, settings)
+    size = measure(state, aid, heading_before, settings, work)
+    if size == 0:
+        return
+    follow(state, aid, work)
+    gate = gate_of(state, aid, size, settings)
+    aid.verdict, aid.nis = update(state, size, gate, work)
+    recover(state, aid, size, gate, settings, work)
+    watch_aid(state, aid, size, gate, work, settings)
+    if aid.verdict == FUSED and state.heading_known == 0:
+        search_heading(state, aid, gate, settings, work)
+    if aid.stream == GNSS_POSITION:
+        mag.note_field(state, aid)
+    elif aid.stream == WHEEL:
+        watch_wheels(state, aid)
+    note_jump(state, position_before, heading_before, settings)
+
+
+@njit
+def take_evidence(state, aid, settings):
+    """Note what a measurement says of place, course, motion and rest: that counts whatever becomes of it."""
+    if aid.stream == GNSS_POSITION:
+        note_position(state, aid, settings)
+    elif aid.stream == GNSS_VELOCITY:
+        note_velocity(state, aid, settings)
+        watch_course(state, aid, heading_of(state, settings), settings)
+    note_evidence(state, aid, settings)
+
+
+@njit
+def wait_for_alignment(state, aid, settings, work):
+    """Leave a measurement that comes too early; wheels help to find the heading before they are fused."""
+    if aid.stream == WHEEL:
+        search_with_wheels(state, aid.payload, settings.gate[WHEEL, 2], settings, work)
+        watch_wheels(state, aid)
+    aid.verdict = BEFORE_ALIGNMENT if aid.stream < FIRST_CONSTRAINT else INACTIVE
+
+
+@njit
+def begin(state, aid, settings):
+    """Take the position from the first fix, and the heading from memory if the robot is where it was left."""
+    position = (state.position_map[0], state.position_map[1], state.position_map[2])
+    heading_before = heading_of(state, settings)
+    start_position(state, aid.payload)
+    recall_heading(state, aid.payload, settings)
+    note_jump(state, position, heading_before, settings)
+
+
+@njit
+def measure(state, aid, heading_before, settings, work):
+    """Write innovation, Jacobian and noise to ``work`` and return the size; 0 and a verdict if it is not to be fused.
+
+    A heading is what the first of those that tell it makes known: the measurement is linearized anew there.
+    """
+    if aid.stream == MAG:
+        mag.note_way(state, heading_before, settings)
+        is_disturbed = mag.is_disturbed(state, aid, settings)
+        watch_field(state, is_disturbed)
+        if is_disturbed:
+            aid.verdict = GATE
+            return 0
+    size = linearize(state, aid, settings, work)
+    if size == 0:
+        aid.verdict = INACTIVE
+        return 0
+    if aid.stream in (HEADING, MAG):
+        watch_heading(state, aid, work)
+        if state.heading_known == 0:
+            if not is_heading_told(state, aid, settings, work):
+                aid.verdict = BEFORE_ALIGNMENT
+                return 0
+            size = linearize(state, aid, settings, work)
+    for k in range(size):
+        aid.innovation[k] = work.innovation[k]
+    aid.dof = size
+    return size
+
+
+@njit
+def is_aligned_for(state, stream):
+    """Say whether the start-up is far enough for a measurement of a stream."""
+    if state.level_known == 0:
+        return False
+    if stream == GNSS_POSITION:
+        return True
+    if stream in (GNSS_VELOCITY, HEADING, BARO):
+        return state.position_known == 1
+    if stream == MAG:
+        return state.position_known == 1 and state.field_known == 1
+    return state.position_known == 1 and state.heading_known == 1
+
+
+@njit
+def linearize(state, aid, settings, work):
+    """Write innovation, Jacobian and noise of one measurement to ``work``; return its size. The list of aids.
+
+    Size 0: the measurement says nothing in this state.
+    """
+    if aid.stream == GNSS_POSITION:
+        return gnss_position.linearize(state, aid.payload, aid.source, settings, work)
+    if aid.stream == WHEEL:
+        return wheel.linearize(state, aid.payload, settings, work)
+    if aid.stream == BODY_VELOCITY:
+        return body_velocity.linearize(state, aid.payload, settings, work)
+    if aid.stream == ZUPT:
+        return zupt.linearize(state, settings, work)
+    if aid.stream == ZARU:
+        return zaru.linearize(state, settings, work)
+    if aid.stream == NHC:
+        return nhc.linearize(state, settings, work)
+    if aid.stream == HEADING:
+        return heading.linearize(state, aid.payload, aid.source, settings, work)
+    if aid.stream == MAG:
+        return mag.linearize(state, aid.payload, settings, work)
+    if aid.stream == BARO:
+        return baro.linearize(state, aid.payload, aid.source, settings, work)
+    return gnss_velocity.linearize(state, aid.payload, aid.source, settings, work)
