@@ -13,7 +13,7 @@ from kernels import core
 from eskf_ros.earth import ecef_to_geodetic
 from eskf_ros.filter.layout import ODOMETRY, RECORD, Status, Verdict
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters import Parameters, from_mapping
 from eskf_ros.simulate.scenario import Recording, simulate
 
 SECOND = 1_000_000_000
@@ -179,6 +179,33 @@ def test_a_bad_fix_is_named_and_never_touches_the_state(recording, changes, verd
     after = navigator.state
     for field in ("position_map", "velocity_map", "attitude", "accel_bias", "gyro_bias"):
         assert np.allclose(after[field], before[field], rtol=0, atol=1e-12), field
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"covariance": np.diag([1.0, -1.0, 1.0]).ravel()}, "covariance that is not positive definite"),
+        ({"latitude_deg": math.nan}, "numbers that are not finite"),
+        ({"altitude": 1e7}, "values that cannot be true"),
+    ],
+)
+def test_a_stream_that_is_refused_at_the_door_is_named(changes, words):
+    """Not for a single message, but when most of them are like this."""
+    navigator = Navigator(Parameters())
+    for k in range(20):
+        offer_position(navigator, SECOND + k, **(changes if k >= 5 else {}))
+        assert bool(navigator.complaints) == (k >= 14)
+    (complaint,) = navigator.complaints
+    assert complaint.startswith("15 of 20 messages of gnss_position ")
+    assert words in complaint
+
+
+@pytest.mark.parametrize("broken", [math.nan, -1.0, math.inf])
+def test_a_covariance_that_is_none_is_a_fault(recording, broken):
+    navigator, _ = run(recording)
+    assert navigator.status == Status.GOOD
+    navigator._states["covariance"][0, 7, 7] = broken
+    assert navigator.status == Status.FAULT
 
 
 @pytest.mark.parametrize("stamp", [0, -5])

@@ -93,6 +93,16 @@ ORIENTATION_SHARE = SECOND // 20
 
 DIAGONAL = np.eye(3).ravel()
 
+DOOR_REMEDIES = {
+    Verdict.NON_FINITE: "carry numbers that are not finite: what does the driver write where it knows nothing?",
+    Verdict.BAD_COVARIANCE: "have a covariance that is not positive definite: variances must be positive (all zero "
+    "stands for unknown), covariances smaller",
+    Verdict.BAD_VALUE: "carry values that cannot be true: look at units and fields",
+}
+"""What is said when most messages of a stream are refused for what they contain."""
+
+FEWEST_REFUSED = 10
+
 NO_STAND_IN = (0.0, 0.0, 0.0)
 """The covariance of a message is its own."""
 
@@ -237,6 +247,7 @@ class Navigator:
         self._refused: list[np.ndarray] = []
         self._offered_count: Counter[Stream] = Counter()
         self._refused_count: Counter[Stream] = Counter()
+        self._shut_doors: Counter[tuple[Stream, Verdict]] = Counter()
         self._stamp_difference: dict[Stream, float] = {}
         self._stand_ins = 0
         self.range_statuses: Counter[RangeStatus] = Counter()
@@ -573,6 +584,10 @@ class Navigator:
         found = complaints(self._states[0]) + aid_complaints(self._states[0], self._settings[0])
         if self._field_problem:
             found.append(self._field_problem)
+        for (stream, verdict), count in self._shut_doors.items():
+            offered = self._offered_count[stream]
+            if verdict in DOOR_REMEDIES and count >= FEWEST_REFUSED and 2 * count > offered:
+                found.append(f"{count} of {offered} messages of {stream.name.lower()} {DOOR_REMEDIES[verdict]}")
         for stream, difference in self._stamp_difference.items():
             if 2 * self._refused_count[stream] > self._offered_count[stream]:
                 found.append(
@@ -657,6 +672,8 @@ class Navigator:
     def _push_aid(self, stream: Stream, stamp: int, arrival: int, source: int, door: int) -> None:
         """Sort the record that is on offer into the timeline."""
         self._offered_count[stream] += 1
+        if door != OPEN_DOOR:
+            self._shut_doors[stream, Verdict(door)] += 1
         self._make_room()
         refused = offer_aid(self._aids, self._timeline, self._offered, stamp, arrival, int(stream), source, door)
         if refused:

@@ -34,7 +34,7 @@ def status_of(state, settings):
         return WAITING_IMU
     if state.level_known == 0:
         return LEVELLING
-    if not is_finite(state):
+    if not is_sound(state):
         return FAULT
     if state.position_known == 0:
         return WAITING_FIX
@@ -51,12 +51,14 @@ def status_of(state, settings):
 
 
 @njit
-def is_finite(state):
-    """Say whether position, velocity, attitude and their variances are numbers."""
+def is_sound(state):
+    """Say whether position, velocity, attitude and all variances are numbers, and no variance is negative."""
     total = state.attitude[0] + state.attitude[1] + state.attitude[2] + state.attitude[3]
     for i in range(3):
         total += state.position_map[i] + state.velocity_map[i]
     for i in range(ERROR_SIZE):
+        if not state.covariance[i, i] >= 0.0:
+            return False
         total += state.covariance[i, i]
     return math.isfinite(total)
 

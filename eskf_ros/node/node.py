@@ -189,6 +189,8 @@ class EskfNode(Node):
     def _configure(self, parameters: Parameters) -> None:
         self.parameters = self.extrinsics.completed(parameters)
         self.navigator.configure(self.parameters)
+        if self.range_intake is not None:
+            self.range_intake.configure(self.parameters)
         for source in self.aid_inputs:
             source.configure(self.parameters)
 

@@ -18,7 +18,9 @@ from eskf_ros.gnss.ranges import locate
 MARGIN = 1_000_000_000
 """ns around the recording in which epochs still belong to it."""
 LEAD = 1_000_000
-"""ns from the ephemerides to the first epoch."""
+"""ns from the ephemerides to the first epoch, by log time."""
+AGE = 60_000_000_000
+"""ns from the ephemerides to the first epoch, by stamp: as if a receiver had been on for a while, and knew them."""
 EPHEMERIDES_PER_MESSAGE = 500
 
 
@@ -48,8 +50,8 @@ def read_beside(
     """Return the messages for a recording from ``first`` to ``last`` (ns of its clock).
 
     ``clock_offset`` (s): see `range_files.read_range_file`. With ``satellites`` the ranges bring the states of their
-    satellites; those without ephemeris are left plain. The log time of a message is its stamp; ephemerides come
-    before the first epoch. Raises RinexError for files that cannot be read, RangesError when no epoch is in that time.
+    satellites; those without ephemeris are left plain. The log time of an epoch is its stamp; ephemerides come
+    before the first one. Raises RinexError for files that cannot be read, RangesError when no epoch is in that time.
     """
     file = read_range_file(observations, clock_offset)
     files = read_navigation_files(navigation)
@@ -84,7 +86,7 @@ def read_beside(
         notes.append("no ephemeris serves the time of the recording: the ranges have no satellites")
     return Beside(
         Batch(stamps, cloud_messages(stamps, clouds), [frame]),
-        Batch(starts, cloud_messages(starts, parts), [frame]),
+        Batch(starts, cloud_messages(starts - AGE, parts), [frame]),
         len(file.stamps) - len(kept),
         notes,
     )

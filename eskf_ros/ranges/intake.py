@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.filter.strapdown import SECOND
 from eskf_ros.gnss.cloud import CloudError, Epoch, read_epoch, write_epoch
+from eskf_ros.gnss.dated_ephemerides import DatedEphemerides
 from eskf_ros.gnss.ephemeris import Ephemerides
 from eskf_ros.gnss.ephemeris_cloud import read_ephemerides
 from eskf_ros.gnss.measurements import Masks, measured_epoch
@@ -73,23 +75,28 @@ class RangeIntake:
     def __init__(self, navigator: Navigator, parameters: Parameters) -> None:
         """Raises RinexError when a file of ``ranges.rinex_nav_files`` cannot be read."""
         self._navigator = navigator
-        self._solves = parameters.mode == "loose" and parameters.ranges.use_point_solution
-        self._masks = Masks(HORIZON, parameters.ranges.cn0_mask)
-        self._point_settings = PointSettings(
-            elevation_mask=math.radians(parameters.ranges.elevation_mask_deg), cn0_mask=parameters.ranges.cn0_mask
-        )
-        self._time_offset = parameters.ranges.time_offset
+        self.configure(parameters)
         files = read_navigation_files([Path(name) for name in parameters.ranges.rinex_nav_files.split(":") if name])
-        self._ephemerides = Ephemerides(files.records)
-        self._klobuchar = files.klobuchar.get(Gnss.GPS, DEFAULT_KLOBUCHAR)
-        self._last: NDArray[np.float64] | None = None
+        klobuchar = files.klobuchar.get(Gnss.GPS, DEFAULT_KLOBUCHAR)
+        self._ephemerides = DatedEphemerides(files.records, klobuchar, round(parameters.history.window * SECOND))
+        self._knows_ionosphere = klobuchar is not DEFAULT_KLOBUCHAR
         self.epochs = 0
         self.solved = 0
         self.refused: Counter[str] = Counter()
         self.wants_solution = False
 
+    def configure(self, parameters: Parameters) -> None:
+        """Use other masks from now on: what can change while the node runs."""
+        ranges = parameters.ranges
+        self._solves = parameters.mode == "loose" and ranges.use_point_solution
+        self._masks = Masks(HORIZON, ranges.cn0_mask)
+        self._point_settings = PointSettings(
+            elevation_mask=math.radians(ranges.elevation_mask_deg), cn0_mask=ranges.cn0_mask
+        )
+        self._time_offset = round(ranges.time_offset * SECOND)
+
     def take_ephemerides(self, stamp: int, points: NDArray[Any], arrival: int = 0) -> None:
-        """Add the points of a message of `gnss/ephemerides`; they serve the ranges that come after them."""
+        """Add the points of a message of `gnss/ephemerides`; `DatedEphemerides` says which ranges they serve."""
         try:
             read = read_ephemerides(points)
         except CloudError as error:
@@ -98,8 +105,9 @@ class RangeIntake:
         for reason, count in read.refused.items():
             self.refused[f"ephemerides: {reason}"] += count
         if len(read.broadcasts):
-            self._ephemerides.add(read.records)
-        self._klobuchar = read.klobuchar.get(Gnss.GPS, self._klobuchar)
+            klobuchar = read.klobuchar.get(Gnss.GPS)
+            self._ephemerides.add(stamp + self._time_offset, read.records, klobuchar)
+            self._knows_ionosphere = self._knows_ionosphere or klobuchar is not None
 
     def take_ranges(self, stamp: int, points: NDArray[Any], arrival: int = 0) -> PointSolution | None:
         """Give the points of a message of `gnss/ranges` to the navigator; return the point solution if one was made."""
@@ -114,24 +122,24 @@ class RangeIntake:
         if epoch.left_out:
             self.refused["ranges: signals beyond the first 200 of an epoch"] += epoch.left_out
         self.epochs += 1
+        ephemerides, klobuchar = self._ephemerides.at(stamp + self._time_offset)
         if self._solves:
-            solution = self._solution(epoch)
+            solution = self._solution(epoch, ephemerides, klobuchar)
             self._navigator.range_statuses.update(Status(status) for status in epoch.ranges["status"].tolist())
-            self._push_solution(stamp + round(self._time_offset * 1e9), solution, arrival)
+            self._push_solution(stamp + self._time_offset, solution, arrival)
             return solution
         instant = (epoch.week, epoch.seconds)
-        signals = measured_epoch(epoch.ranges, *instant, self._ephemerides, masks=self._masks)
-        self._navigator.push_ranges(stamp, instant, signals, self._klobuchar, arrival)
-        return self._solution(epoch) if self.wants_solution else None
+        signals = measured_epoch(epoch.ranges, *instant, ephemerides, masks=self._masks)
+        self._navigator.push_ranges(stamp, instant, signals, klobuchar, arrival)
+        return self._solution(epoch, ephemerides, klobuchar) if self.wants_solution else None
 
-    def _solution(self, epoch: Epoch) -> PointSolution:
-        """Solve the epoch alone, as a receiver would."""
-        locate(epoch.ranges, epoch.week, epoch.seconds, self._ephemerides)
-        ranges, klobuchar = one_per_satellite(epoch.ranges), self._klobuchar
-        solution = solve(ranges, epoch.week, epoch.seconds, klobuchar, self._point_settings, self._last)
+    def _solution(self, epoch: Epoch, ephemerides: Ephemerides, klobuchar: NDArray[np.float64]) -> PointSolution:
+        """Solve the epoch alone, as a receiver would; from nothing, so that the order of epochs leaves no trace."""
+        locate(epoch.ranges, epoch.week, epoch.seconds, ephemerides)
+        ranges = one_per_satellite(epoch.ranges)
+        solution = solve(ranges, epoch.week, epoch.seconds, klobuchar, self._point_settings)
         if solution.status == SolutionStatus.SOLVED:
             self.solved += 1
-            self._last = solution.position_ecef
         return solution
 
     def _push_solution(self, stamp: int, solution: PointSolution, arrival: int) -> None:
@@ -156,7 +164,7 @@ class RangeIntake:
     def complaints(self) -> list[str]:
         """What is wrong with the messages, one sentence each with what to do; empty when nothing is."""
         found = [f"{count} times: {reason}" for reason, count in self.refused.items()]
-        if self.epochs and self._klobuchar is DEFAULT_KLOBUCHAR:
+        if self.epochs and not self._knows_ionosphere:
             found.append(
                 "no parameters of the ionosphere came with the ephemerides: those of a middling day stand in for them"
             )

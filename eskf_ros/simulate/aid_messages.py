@@ -22,6 +22,9 @@ from eskf_ros.simulate.wheel import WheelMeasurements
 ABSENT = -1.0
 """Variance of what is not measured."""
 
+EPHEMERIDES_AGE = 60_000_000_000
+"""So long (ns) before the recording the receiver has read what the satellites broadcast."""
+
 
 def wheel(measured: WheelMeasurements, part: slice) -> NDArray[Any]:
     """Return nav_msgs/Odometry with forward speed and yaw rate; no pose and no other axis of the twist."""
@@ -87,8 +90,8 @@ def ranges(measured: RangeMeasurements, part: slice) -> NDArray[Any]:
 
 
 def ephemerides(measured: RangeMeasurements, part: slice) -> NDArray[Any]:
-    """Return `gnss/ephemerides` (sensor_msgs/PointCloud2): all there are, once."""
-    stamps = measured.ephemerides_stamp[part]
+    """Return `gnss/ephemerides` (sensor_msgs/PointCloud2): all there are, once, from before the recording."""
+    stamps = measured.ephemerides_stamp[part] - EPHEMERIDES_AGE
     cloud = write_ephemerides(measured.broadcasts, measured.klobuchar)
     return cloud_messages(stamps, [cloud] * len(stamps), Frame.GNSS)
 
