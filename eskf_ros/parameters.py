@@ -92,8 +92,8 @@ class Frames:
     extrinsics: str = _choice(
         "auto",
         "Where the node takes the places of the sensors in base_link from. auto: a sensor whose parameters "
-        "(imu.mount_position and imu.mount_rpy_deg, gnss.lever_arm) are all zero is looked up on /tf_static by the "
-        "header.frame_id of its messages. parameters: /tf_static is not looked at; so it is in the replay.",
+        "(imu.mount_position and imu.mount_rpy_deg, gnss.lever_arm, and so on) are all zero is looked up on /tf_static "
+        "by the header.frame_id of its messages. parameters: /tf_static is not looked at; so it is in the replay.",
         "parameters",
     )
 

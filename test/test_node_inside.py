@@ -193,6 +193,30 @@ def test_a_place_found_in_time_restarts_nothing_and_one_found_late_does(make, st
 
 
 @needs_ros
+@pytest.mark.parametrize(
+    ("topic", "type_name", "position"),
+    [
+        ("body_velocity", TWIST, "mount_position"),
+        ("gnss/heading", IMU, ""),
+        ("imu/mag", "sensor_msgs/msg/MagneticField", ""),
+    ],
+)
+def test_mountings_are_found_on_tf_static(make, start, topic, type_name, position):
+    from test_node_frames import Rotation, transform
+    from test_node_inputs import serialised
+
+    inside = make()
+    turned = transform(
+        "base_link", "sensor", (0.3, 0.1, -0.4), Rotation.from_euler("xyz", (0.0, 0.0, 90.0), degrees=True)
+    )
+    inside.node._on_static_transforms(SimpleNamespace(transforms=[turned]))
+    inside.give(topic, serialised(type_name, "sensor", stamp=start[-1][0]))
+    mounted = getattr(inside.node.parameters, topic.split("/")[-1])
+    assert mounted.mount_rpy_deg == pytest.approx((0.0, 0.0, 90.0))
+    assert not position or getattr(mounted, position) == (0.3, 0.1, -0.4)
+
+
+@needs_ros
 def test_velocities_of_another_type(make, drive):
     """TwistStamped in place of TwistWithCovarianceStamped: fused, with the stand-in for the covariance."""
     from rclpy.serialization import deserialize_message, serialize_message

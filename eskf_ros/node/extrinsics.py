@@ -16,6 +16,7 @@ Pose = tuple[np.ndarray, np.ndarray]
 
 IMU, ANTENNA, SECOND_ANTENNA = "IMU", "GNSS antenna", "second GNSS antenna"
 MAGNETOMETER, BAROMETER = "magnetometer", "barometer"
+DUAL_ANTENNA, BODY_VELOCITY = "dual antenna", "velocity sensor"
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,8 @@ PLACES = {
     SECOND_ANTENNA: Place("second_gnss.lever_arm"),
     MAGNETOMETER: Place(rotation="mag.mount_rpy_deg", inputs=("mag",)),
     BAROMETER: Place("baro.position", inputs=("baro",)),
+    DUAL_ANTENNA: Place(rotation="heading.mount_rpy_deg", inputs=("heading",)),
+    BODY_VELOCITY: Place("body_velocity.mount_position", "body_velocity.mount_rpy_deg", ("body_velocity",)),
 }
 """One row for each sensor whose place in base_link counts."""
 
