@@ -707,7 +707,16 @@ class Ranges(Aid):
     correlated_std: float = _parameter(
         1.5,
         "m",
-        "With a correlation_time: the standard deviation of a position, per axis, by errors that last.",
+        "With a correlation_time: the standard deviation of a position by errors that last, per horizontal axis ...",
+        above=0.0,
+        maximum=1000.0,
+        live=True,
+    )
+    correlated_std_vertical: float = _parameter(
+        3.0,
+        "m",
+        "... and vertically, where the atmosphere is not averaged out. More without parameters of the ionosphere for "
+        "the day (5 m): the stand-in may be wrong by its own size.",
         above=0.0,
         maximum=1000.0,
         live=True,

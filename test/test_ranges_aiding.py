@@ -27,7 +27,13 @@ Array = NDArray[np.float64]
 MOUNT = {"imu__mount_position": [0.3, 0.1, -0.2], "imu__mount_rpy_deg": [10.0, -20.0, 130.0]}
 WHITE = {"mode": "tight", "ranges__correlation_time": 0.0}
 SETTINGS = make_settings(**WHITE, gnss__lever_arm=[0.8, -0.2, 1.4], **MOUNT)
-LASTING = make_settings(mode="tight", ranges__correlation_time=60.0, ranges__correlated_std=2.5, **MOUNT)
+LASTING = make_settings(
+    mode="tight",
+    ranges__correlation_time=60.0,
+    ranges__correlated_std=2.5,
+    ranges__correlated_std_vertical=4.0,
+    **MOUNT,
+)
 LONG_ARM = make_settings(**WHITE, gnss__lever_arm=[25.0, -12.0, 8.0], **MOUNT)
 KLOBUCHAR = np.array([1.77e-8, 2.235e-8, -1.192e-7, -5.96e-8, 1.27e5, 1.475e5, -1.966e5, -1.966e5])
 

@@ -474,7 +474,7 @@ SETTINGS = np.dtype(
         ("range_covariance_scale", "f8"),
         ("code_std_floor", "f8"),
         ("range_rate_std_floor", "f8"),
-        ("range_error_std", "f8"),
+        ("range_error_std", "f8", (3,)),
         ("gate", "f8", (len(Stream), 4)),
         ("reach", "i8", (len(Stream),)),
         ("constrains", "i8", (len(Stream),)),

@@ -192,7 +192,8 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
     settings["range_covariance_scale"] = parameters.ranges.covariance_scale
     settings["code_std_floor"] = parameters.ranges.code_std_floor
     settings["range_rate_std_floor"] = parameters.ranges.range_rate_std_floor
-    settings["range_error_std"] = parameters.ranges.correlated_std
+    horizontal, vertical = parameters.ranges.correlated_std, parameters.ranges.correlated_std_vertical
+    settings["range_error_std"] = (horizontal, horizontal, vertical)
     place_optional_states(settings[0], parameters)
     settings["static_duration"] = alignment.static_duration
     settings["moving_start_after"] = alignment.moving_start_after

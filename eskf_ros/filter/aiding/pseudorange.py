@@ -7,7 +7,7 @@ the attitude on the map side, one for clock bias and offset. The atmosphere is t
 
 What lasts in the errors of all ranges together (reflections, orbits, atmosphere) may be an optional state: it moves the
 antenna that the satellites see by a standard deviation times a state of unit variance per axis (first-order
-Gauss-Markov).
+Gauss-Markov). Vertically more than horizontally: what the models leave of the atmosphere is above, on all sides.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def predict(state, payload, source, settings):
     place = settings.position_error_at
     if place < state.error_size:
         for i in range(3):
-            pseudorange -= unit[i] * settings.range_error_std * state.optional[place - ERROR_SIZE + i]
+            pseudorange -= unit[i] * settings.range_error_std[i] * state.optional[place - ERROR_SIZE + i]
     return pseudorange, unit, elevation, ionosphere
 
 
@@ -137,5 +137,5 @@ def linearize(state, payload, source, settings, work):
     place = settings.position_error_at
     if place < state.error_size:
         for i in range(3):
-            work.jacobian[0, place + i] = -unit[i] * settings.range_error_std
+            work.jacobian[0, place + i] = -unit[i] * settings.range_error_std[i]
     return SIZE
