@@ -15,6 +15,7 @@ from eskf_ros.parameters import from_mapping
 from eskf_ros.simulate.episodes import Outage
 from eskf_ros.simulate.gnss_episodes import CorrelatedErrors, Multipath, Overconfidence, Spoofing
 from eskf_ros.simulate.imu import grade_parameters
+from eskf_ros.simulate.sampling import START_STAMP
 from eskf_ros.simulate.scenario import simulate
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "benchmark"))
@@ -117,7 +118,17 @@ def test_fixes_that_are_drawn_away_are_named_with_their_speed() -> None:
 def test_a_receiver_that_lies_consistently_is_caught_by_the_imu() -> None:
     complaints = navigated("drive", 9, stop=130.0, episodes=(Spoofing(100.0, 60.0, (5.0, 0.0, 0.0), 0.5),)).complaints
     (sentence,) = (text for text in complaints if "IMU went different ways" in text)
-    assert 100.0 < numbers(sentence)[1] < 108.0
+    assert 100.0 < numbers(sentence)[1] - START_STAMP * 1e-9 < 108.0
+
+
+def test_the_scale_to_set_does_not_depend_on_the_one_that_is_set() -> None:
+    lies = (Overconfidence(0.0, np.inf, 3.0),)
+    advised = []
+    for scale in (1.0, 2.0):
+        complaints = navigated("drive", 10, {"gnss.covariance_scale": scale}, episodes=lies).complaints
+        (sentence,) = (text for text in complaints if "set gnss.covariance_scale" in text)
+        advised.append(float(re.findall(r"covariance_scale to ([\d.]+)", sentence)[0]))
+    assert advised == pytest.approx([9.0, 9.0], rel=0.25)
 
 
 @pytest.mark.parametrize("changes", [{}, POSITION_ONLY])

@@ -501,7 +501,8 @@ def distrusting(robots: int, std: float, speed: float = 0.0) -> int:
                 break
             if epoch % 10 == 0:
                 state["still_stamp"] = aid["stamp"]
-                state["anchor_stamp"], state["anchor_ecef"] = state["last_fix_stamp"], state["last_fix_ecef"]
+                state["anchor_stamp"][:] = state["last_fix_stamp"]
+                state["anchor_ecef"][:] = state["last_fix_ecef"]
     return found
 
 

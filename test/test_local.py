@@ -7,10 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from eskf_ros.filter.layout import Status
+from eskf_ros.filter.heading_search import COSINE as SEARCH_COSINE
+from eskf_ros.filter.layout import Status, Stream
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.parameters import from_mapping
 from eskf_ros.simulate.scenario import Recording, simulate
+
+SECOND = 1_000_000_000
 
 
 @pytest.fixture(scope="module", params=["mount at base_link", "IMU mounted apart"])
@@ -116,3 +119,29 @@ def test_a_new_datum_moves_the_map_and_not_the_local_pose(driven):
     assert np.abs(steps_of(around["position_odom"], around)).max() < 0.03
     turn = np.diff(heading(around["attitude_body_to_odom"]))
     assert np.abs(turn - around["angular_rate_body"][1:, 2] * np.diff(around["stamp"]) * 1e-9).max() < 0.01
+
+
+def test_a_heading_that_wheels_tell_turns_the_map_and_not_the_local_pose(driven):
+    """The search says a quarter turn, and is as good as sure when the next message of the wheels comes."""
+    recording, _ = driven
+    navigator = Navigator(from_mapping({**recording.parameters(), "gnss.lever_arm": [2.0, 1.0, 0.5]}))
+    until = int(recording.imu_stamp[0]) + 7 * SECOND
+    for epoch in range(int(np.searchsorted(recording.fix_stamp, until))):
+        give_imu(navigator, recording, recording.fix_stamp[epoch])
+        give_fix(navigator, recording, epoch)
+    before = give_imu(navigator, recording, until)[-1]
+    state = navigator._states[0]
+    assert state["search_started"] == 1
+    assert state["heading_known"] == 0
+    quarter = SEARCH_COSINE, SEARCH_COSINE + 1
+    state["search"][list(quarter)] = 0.0, 1.0
+    state["search_covariance"][quarter, :] = state["search_covariance"][:, quarter] = 0.0
+    state["search_covariance"][quarter, quarter] = 1e-5
+    navigator.push(Stream.WHEEL, until + 1, (1.0, 0.0, 0.0), np.diag([100.0, 1.0, -1.0]).ravel())
+    after = give_imu(navigator, recording, until + SECOND // 20)[-1]
+    assert navigator.state["heading_known"][0] == 1
+    turned = heading(np.array([after["attitude_body_to_map"], before["attitude_body_to_map"]]))
+    assert abs(turned[0] - turned[1]) > 1.0
+    stayed = heading(np.array([after["attitude_body_to_odom"], before["attitude_body_to_odom"]]))
+    assert abs(stayed[0] - stayed[1]) < 0.01
+    assert np.linalg.norm(after["position_odom"] - before["position_odom"]) < 0.1

@@ -154,12 +154,46 @@ def test_too_few_satellites_are_no_start(count: int) -> None:
     assert (outcome.records["verdict"] == Verdict.BEFORE_ALIGNMENT).all()
 
 
+def test_a_start_that_fails_moves_no_local_pose() -> None:
+    """The datum is kilometres away; four satellites, some of them below the mask, give a coarse place and no more."""
+    recording = drive(3, 12.0)
+    ranges = simulate_ranges(recording, 5, systems=GPS)
+    ranges.signals = [signals[:4] for signals in ranges.signals]
+    latitude, longitude, altitude = recording.datum
+    changes = {"datum": [latitude + 0.02, longitude, altitude], "ranges__elevation_mask_deg": 60.0}
+    navigator = tight_navigator(recording, **changes)
+    rows = []
+    for k in range(len(ranges.stamp)):
+        newest = navigator.state["imu_stamp"][0]
+        part = (recording.imu_stamp > newest) & (recording.imu_stamp <= ranges.stamp[k])
+        samples = (recording.imu_stamp, recording.specific_force, recording.angular_rate)
+        rows.append(navigator.push_imu(*(column[part] for column in samples)))
+        ranges.push(navigator, k)
+    assert navigator.status == Status.WAITING_FIX
+    assert np.linalg.norm(navigator.state["position_map"][0]) > 1000.0
+    assert np.abs(np.concatenate(rows)["position_odom"]).max() < 1.0
+
+
 def test_one_constellation_other_than_gps_is_enough() -> None:
     recording = drive()
     outcome = follow(recording, simulate_ranges(recording, 6, systems=(Gnss.GALILEO,)), tight_navigator(recording))
     assert outcome.navigator.status == Status.GOOD
     errors, covariance = outcome.error[outcome.seconds > 30.0], outcome.covariance[outcome.seconds > 30.0]
     assert (np.abs(errors[:, :3]) < 5.0 * np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)[:, :3])).all()
+
+
+def test_rest_is_seen_in_ranges_alone() -> None:
+    """The velocity of an epoch speaks for rest as that of a receiver does, and for motion."""
+    recording = drive(3, 40.0)
+    w, x, y, z = recording.truth_attitude_body_to_map[0]
+    heading = math.degrees(math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+    navigator = tight_navigator(recording, alignment__initial_heading_deg=heading)
+    outcome = follow(recording, simulate_ranges(recording, 3), navigator)
+    for stream in (Stream.ZUPT, Stream.ZARU):
+        assert len(outcome.of(stream)) > 0
+    speed = np.linalg.norm(recording.truth_velocity_map, axis=1)
+    at = np.searchsorted(recording.truth_stamp, outcome.of(Stream.ZUPT)["stamp"])
+    assert speed[np.minimum(at, len(speed) - 1)].max() < 0.1
 
 
 @pytest.mark.parametrize("jumps", [(1,), (-3, 2)])

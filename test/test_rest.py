@@ -151,3 +151,33 @@ def test_a_smooth_motorway_is_no_rest(seed: int) -> None:
     records = result.records
     zeros = records[(records["stream"] == Stream.ZUPT) & (records["verdict"] == Verdict.FUSED)]
     assert len(zeros) == 0
+
+
+@pytest.mark.parametrize("std", [0.02, 0.3])
+def test_two_antennas_of_a_robot_at_rest_are_no_motion(std: float) -> None:
+    """They are two metres apart, and each stays where it is."""
+    recording = simulate("parked", 5, imu_rate=100.0, stop=60.0, lever_arm=(0.0, 0.0, 0.0), position_std=(std, std))
+    second = {"second_gnss.frame_id": "rear", "second_gnss.lever_arm": [-2.0, 0.0, 0.0]}
+    navigator = Navigator(from_mapping({**recording.parameters(), "gnss.use_velocity": False, **second}))
+    apart = 2.0 / 6.37e6
+    done = 0
+    for k, stamp in enumerate(recording.fix_stamp):
+        until = int(np.searchsorted(recording.imu_stamp, stamp))
+        part = slice(done, until)
+        navigator.push_imu(recording.imu_stamp[part], recording.specific_force[part], recording.angular_rate[part])
+        done = until
+        latitude, longitude = float(recording.fix_latitude_deg[k]), float(recording.fix_longitude_deg[k])
+        for shift, frame in ((0.0, "front"), (math.degrees(apart), "rear")):
+            navigator.push_gnss_position(
+                int(stamp),
+                latitude + shift,
+                longitude,
+                float(recording.fix_altitude[k]),
+                recording.fix_covariance[k],
+                2,
+                0,
+                frame_id=frame,
+            )
+    state = navigator.state[0]
+    assert state["moving_stamp"] < recording.imu_stamp[0]
+    assert state["still_count"] > 4000

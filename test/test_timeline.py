@@ -315,6 +315,27 @@ def test_no_samples_far_behind_a_barrier_are_believed(recording):
     assert navigator.imu_counts["late"] == 50
 
 
+def test_a_datum_set_before_the_first_sample_is_no_barrier(recording):
+    """Nothing was given out yet: a first stamp that was never true is taken back, and the fixes that wait stay."""
+    navigator = navigator_for(recording)
+    push(navigator, recording, Message(POSITION, 0, 0.0, 0))
+    navigator.set_datum(48.0, 11.0, 500.0)
+    assert navigator.waiting == 1
+    push_imu(navigator, recording, slice(0, 1), 3600 * SECOND)
+    push_imu(navigator, recording, slice(0, 50))
+    assert navigator.imu_counts["late"] == 0
+    assert navigator.datum == pytest.approx((48.0, 11.0, 500.0), abs=1e-9)
+
+
+def test_records_survive_a_barrier(recording):
+    navigator = navigator_for(recording)
+    push_imu(navigator, recording, slice(0, 400))
+    for epoch in range(6):
+        push(navigator, recording, Message(POSITION, epoch, 0.0, 0))
+    navigator.set_datum(48.0, 11.0, 500.0)
+    assert len(navigator.finish()) == 6
+
+
 def test_nothing_in_a_long_window_is_far_behind(recording):
     """The newest sample comes first: all others are in time, more than ten seconds behind it and in a row."""
     in_order = navigator_for(recording, **{"history.window": 60.0})

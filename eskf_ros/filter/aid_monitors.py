@@ -284,7 +284,7 @@ def aid_complaints(state: np.void, settings: np.void) -> list[str]:
         if state["fix_count"][source] < MANY_FIXES:
             continue
         faults = _fault_complaints(state, settings, source)
-        lies = _covariance_complaints(state, source)
+        lies = _covariance_complaints(state, source, float(settings["gnss_covariance_scale"]))
         # What follows from those needs no sentence of its own.
         found += faults + lies
         if not faults and not lies:
@@ -341,13 +341,13 @@ def _fault_complaints(state: np.void, settings: np.void, source: int) -> list[st
     return found
 
 
-def _covariance_complaints(state: np.void, source: int) -> list[str]:
+def _covariance_complaints(state: np.void, source: int, scale: float) -> list[str]:
     count, scattered = int(state["fix_count"][source]), int(state["scattered_fixes"][source])
     if scattered > max(MANY_FIXES, count // 20):
         factor = float(state["scatter_sum"][source]) / scattered
         return [
             f"the fixes{_of(source)} scatter {math.sqrt(factor):.1f} times as much as they claim ({scattered} of "
-            f"{count}): set gnss.covariance_scale to {factor:.2g}, or gnss.position_std_floor"
+            f"{count}): set gnss.covariance_scale to {factor * scale:.2g}, or gnss.position_std_floor"
         ]
     share = math.sqrt(float(state["scatter"][source]))
     if share < MODEST_SCATTER:
@@ -389,10 +389,10 @@ def _departure_complaints(state: np.void, source: int) -> list[str]:
     departures = int(state["departures"][source])
     if departures < FEW_DEPARTURES:
         return []
-    seconds = (int(state["departure_stamp"][source]) - int(state["first_stamp"])) * 1e-9
+    stamp = int(state["departure_stamp"][source]) * 1e-9
     return [
-        f"the receiver{_of(source)} and the IMU went different ways {departures} times, first {seconds:.0f} s after "
-        "the start: multipath, spoofing, or IMU noise parameters that are too small"
+        f"the receiver{_of(source)} and the IMU went different ways {departures} times, first at the stamp "
+        f"{stamp:.1f}: multipath, spoofing, or IMU noise parameters that are too small"
     ]
 
 

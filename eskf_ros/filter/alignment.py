@@ -35,6 +35,7 @@ from eskf_ros.filter.layout import (
     GYRO_BIAS,
     NEVER,
     POSITION,
+    SOURCES,
     VELOCITY,
     Stream,
 )
@@ -217,9 +218,10 @@ def watch_stillness(state, settings):
     if state.window_start == NEVER:
         state.window_start = state.stamp
         state.window_count = 0
-        state.anchor_stamp = state.last_fix_stamp
-        for i in range(3):
-            state.anchor_ecef[i] = state.last_fix_ecef[i]
+        for source in range(SOURCES):
+            state.anchor_stamp[source] = state.last_fix_stamp[source]
+            for i in range(3):
+                state.anchor_ecef[source, i] = state.last_fix_ecef[source, i]
         for i in range(6):
             state.window_sum[i] = 0.0
             state.window_square_sum[i] = 0.0
@@ -234,7 +236,7 @@ def watch_stillness(state, settings):
         return
     still = is_still(state, settings) and state.motion_stamp < state.window_start and is_same_rest(state, settings)
     watch_input(state, still, settings)
-    if state.position_known == 1 and max(state.last_fix_stamp, state.resting_stamp) < state.window_start:
+    if state.position_known == 1 and max(state.last_fix_stamp.max(), state.resting_stamp) < state.window_start:
         # Without a fix or wheels since it began nobody knows whether a slow acceleration passes for a tilt.
         still = False
     if not still:
@@ -260,21 +262,21 @@ def note_position(state, aid, settings):
     """Remember a fix, and what it says about motion."""
     fix = geodetic_to_ecef(aid.payload[0], aid.payload[1], aid.payload[2])
     std = math.sqrt(max(aid.payload[3], aid.payload[6], aid.payload[8]))
-    note_place(state, fix, std, aid.stamp, settings)
+    note_place(state, fix, std, aid.stamp, aid.source, settings)
 
 
 @njit
-def note_place(state, ecef, std, stamp, settings):
-    """Remember a place (m), and look at the displacement since the one before the current stillness window."""
-    if NEVER < state.anchor_stamp < stamp:
-        a = state.anchor_ecef
+def note_place(state, ecef, std, stamp, source, settings):
+    """Remember the place (m) of an antenna, and look how far it is from that before the current stillness window."""
+    if NEVER < state.anchor_stamp[source] < stamp:
+        a = state.anchor_ecef[source]
         step = (ecef[0] - a[0], ecef[1] - a[1], ecef[2] - a[2])
-        seconds = (stamp - state.anchor_stamp) * 1e-9
+        seconds = (stamp - state.anchor_stamp[source]) * 1e-9
         speed = (math.sqrt(dot(step, step)) - POSITION_SIGMAS * math.sqrt(2.0) * std) / seconds
-        note_speed(state, speed, state.anchor_stamp, stamp, settings)
-    state.last_fix_stamp = stamp
+        note_speed(state, speed, state.anchor_stamp[source], stamp, settings)
+    state.last_fix_stamp[source] = stamp
     for i in range(3):
-        state.last_fix_ecef[i] = ecef[i]
+        state.last_fix_ecef[source, i] = ecef[i]
 
 
 @njit

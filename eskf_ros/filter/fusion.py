@@ -60,6 +60,17 @@ def fuse(state, aids, i, settings, work):
         return
     aid = aids[i]
     take_evidence(state, aid, settings)
+    if aid.stream == GNSS_POSITION and state.level_known == 1 and state.position_known == 0:
+        begin(state, aid, settings)
+    position_before = (state.position_map[0], state.position_map[1], state.position_map[2])
+    heading_before = heading_of(state, settings)
+    offer(state, aid, heading_before, settings, work)
+    note_jump(state, position_before, heading_before, settings)
+
+
+@njit
+def offer(state, aid, heading_before, settings, work):
+    """Fuse one measurement or refuse it; ``heading_before`` (rad) is that of the prediction."""
     if not is_aligned_for(state, aid.stream):
         wait_for_alignment(state, aid, settings, work)
         return
@@ -67,11 +78,6 @@ def fuse(state, aids, i, settings, work):
         # It is made of the same IMU: good for a start, and nothing new afterwards.
         aid.verdict = INACTIVE
         return
-    if state.position_known == 0 and aid.stream == GNSS_POSITION:
-        begin(state, aid, settings)
-
-    position_before = (state.position_map[0], state.position_map[1], state.position_map[2])
-    heading_before = heading_of(state, settings)
     join(state, settings.reach[aid.stream], settings)
     watch_solution(state, aid, settings)
     size = measure(state, aid, heading_before, settings, work)
@@ -88,7 +94,6 @@ def fuse(state, aids, i, settings, work):
         mag.note_field(state, aid)
     elif aid.stream == WHEEL:
         watch_wheels(state, aid)
-    note_jump(state, position_before, heading_before, settings)
 
 
 @njit

@@ -214,13 +214,14 @@ STATE = np.dtype(
         ("hint_stamp", "i8"),
         ("hint_turn", "f8"),
         ("hint_std", "f8"),
-        # External evidence of motion: when GNSS last proved it, the last fix, and the one the window started from.
+        # External evidence of motion: when GNSS last proved it; by receiver, whose antennas are apart, the last fix and
+        # the one the window started from.
         ("motion_stamp", "i8"),
-        ("last_fix_stamp", "i8"),
-        ("last_fix_ecef", "f8", (3,)),
+        ("last_fix_stamp", "i8", (SOURCES,)),
+        ("last_fix_ecef", "f8", (SOURCES, 3)),
         ("last_fix_variance", "f8", (SOURCES,)),
-        ("anchor_stamp", "i8"),
-        ("anchor_ecef", "f8", (3,)),
+        ("anchor_stamp", "i8", (SOURCES,)),
+        ("anchor_ecef", "f8", (SOURCES, 3)),
         # Stillness: sums over the window being filled, and over the unbroken run of still windows before it.
         ("window_start", "i8"),
         ("window_count", "i8"),
@@ -259,9 +260,9 @@ STATE = np.dtype(
         ("moving_level", "f8"),
         ("resting_level", "f8"),
         ("quiet", "i8"),
-        ("quiet_fix_stamp", "i8"),
-        ("quiet_fix_variance", "f8"),
-        ("quiet_fix_ecef", "f8", (3,)),
+        ("quiet_fix_stamp", "i8", (SOURCES,)),
+        ("quiet_fix_variance", "f8", (SOURCES,)),
+        ("quiet_fix_ecef", "f8", (SOURCES, 3)),
         ("quiet_pressure_stamp", "i8"),
         ("quiet_pressure", "f8"),
         # Wheels: when they spoke last, and when the gate last refused to believe them.
@@ -457,6 +458,7 @@ SETTINGS = np.dtype(
         ("mag_inclination_tolerance", "f8"),
         ("mag_error_distance", "f8"),
         ("is_orientation_magnetic", "i8"),
+        ("gnss_covariance_scale", "f8"),
         ("correlated_share", "f8"),
         ("zupt_velocity_std", "f8"),
         ("zupt_rate_std", "f8"),

@@ -88,8 +88,8 @@ IMU_BATCH = 1024
 HIGHEST_ALTITUDE = 1e5
 """What no receiver on a robot reports (m)."""
 
-ORIENTATION_SHARE = SECOND // 20
-"""Of each second so much (ns) of what the IMU says of its orientation is used."""
+ORIENTATION_SHARE = SECOND // 10
+"""Of each second so much (ns) of what the IMU says of its orientation is used: a sample at least, from 10 Hz on."""
 
 DIAGONAL = np.eye(3).ravel()
 
@@ -278,14 +278,13 @@ class Navigator:
         self.update()
         state, settings = self._states[0], self._settings[0]
         position, heading = tuple(state["position_map"]), heading_of(state, settings)
-        self._refused.insert(0, self._take_records(True))
         datum = math.radians(latitude_deg), math.radians(longitude_deg), float(altitude)
         if state["position_known"]:
             move_datum(state, *datum, settings)
             note_jump(state, position, heading, settings)
         else:
             set_datum(state, *datum)
-        raise_barrier(self._states, self._blank, self._timeline)
+        self._raise_barrier()
 
     def set_pose(
         self, position_map: Sequence[float], position_covariance: FloatArray, heading: float, heading_std: float
@@ -299,11 +298,10 @@ class Navigator:
         if not (state["level_known"] and state["datum_known"]):
             return False
         before, heading_before = tuple(state["position_map"]), heading_of(state, settings)
-        self._refused.insert(0, self._take_records(True))
         covariance = np.ascontiguousarray(position_covariance, np.float64)
         place(state, tuple(float(v) for v in position_map), covariance, float(heading), float(heading_std), settings)
         note_jump(state, before, heading_before, settings)
-        raise_barrier(self._states, self._blank, self._timeline)
+        self._raise_barrier()
         return True
 
     def push_imu(self, stamps: StampArray, specific_force: FloatArray, angular_rate: FloatArray) -> np.ndarray:
@@ -690,6 +688,13 @@ class Navigator:
         if frontier != NEVER:
             self._refused_count[stream] += 1
             self._stamp_difference[stream] = (stamp - frontier) / SECOND
+
+    def _raise_barrier(self) -> None:
+        """Make what came so far final: see `timeline.raise_barrier`."""
+        if self._timeline["frontier"][0] != NEVER:
+            records = self._take_records(True)
+            self._refused.append(records)
+        raise_barrier(self._states, self._blank, self._timeline)
 
     def _take_records(self, everything: bool) -> np.ndarray:
         records = allocate(RECORD, max(1, int(self._timeline["aid_count"][0] - self._timeline["recorded"][0])))

@@ -111,8 +111,8 @@ def write_odometry(state, local, settings, row):
         row.angular_rate_body[i] = rate_base[i]
         row.accel_bias[i] = state.accel_bias[i]
         row.gyro_bias[i] = state.gyro_bias[i]
-        row.accel_bias_std[i] = math.sqrt(covariance[ACCEL_BIAS + i, ACCEL_BIAS + i])
-        row.gyro_bias_std[i] = math.sqrt(covariance[GYRO_BIAS + i, GYRO_BIAS + i])
+        row.accel_bias_std[i] = math.sqrt(max(covariance[ACCEL_BIAS + i, ACCEL_BIAS + i], 0.0))
+        row.gyro_bias_std[i] = math.sqrt(max(covariance[GYRO_BIAS + i, GYRO_BIAS + i], 0.0))
     write_local_pose(state, local, attitude, settings, row)
     write_pose_covariance(covariance, imu_offset, row)
     write_twist_covariance(state, base_to_map, settings, row)

@@ -61,6 +61,7 @@ from eskf_ros.filter.layout import (
 from eskf_ros.filter.local import note_jump
 from eskf_ros.filter.optional import join, renew
 from eskf_ros.filter.recovery import note_epoch
+from eskf_ros.filter.stillness import weigh_speed
 from eskf_ros.filter.timeline import offer_aid, open_record
 from eskf_ros.filter.update import invert_positive, project, update
 from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, Status
@@ -204,7 +205,13 @@ def fuse_ranges(state, aids, first, end, settings, work):
         return
     position = (state.position_map[0], state.position_map[1], state.position_map[2])
     heading = heading_of(state, settings)
-    which = 0 if aids[first].stream == PSEUDORANGE else 1
+    offer_epoch(state, aids, first, end, 0 if aids[first].stream == PSEUDORANGE else 1, settings, work)
+    note_jump(state, position, heading, settings)
+
+
+@njit
+def offer_epoch(state, aids, first, end, which, settings, work):
+    """Fuse the signals of an epoch, pseudoranges (``which`` 0) or range rates (1), or refuse them."""
     if state.level_known == 0:
         note_coarsely(state, aids, first, end, which, settings, work)
     elif state.position_known == 0 and which == 0:
@@ -228,13 +235,12 @@ def fuse_ranges(state, aids, first, end, settings, work):
     for i in range(first, end):
         if aids[i].verdict == WAITING:
             fuse_signal(state, aids[i], settings, work)
-            if aids[i].verdict != GATE:
+            if aids[i].verdict in (FUSED, WEIGHED_DOWN):
                 fused += 1
     if which == 0 and fused >= FEWEST_TO_SOLVE:
         note_epoch(state, FUSED)
     elif which == 0 and work.signal_count >= FEWEST_TO_JUDGE and 2 * fused < work.signal_count:
         note_epoch(state, GATE)
-    note_jump(state, position, heading, settings)
 
 
 @njit
@@ -504,9 +510,11 @@ def note_solution(state, stamp, which, settings, work):
         offset = rotate(state.map_to_ecef, measured)
         origin = state.origin_ecef
         ecef = (origin[0] + offset[0], origin[1] + offset[1], origin[2] + offset[2])
-        note_place(state, ecef, std, stamp, settings)
+        note_place(state, ecef, std, stamp, 0, settings)
     else:
-        note_speed(state, math.sqrt(dot(measured, measured)) - VELOCITY_SIGMAS * std, stamp, stamp, settings)
+        speed = math.sqrt(dot(measured, measured))
+        note_speed(state, speed - VELOCITY_SIGMAS * std, stamp, stamp, settings)
+        weigh_speed(state, stamp, speed, std, True)
     if state.heading_known == 0:
         for i in range(3):
             for j in range(3):
@@ -574,9 +582,9 @@ def note_coarsely(state, aids, first, end, which, settings, work):
         found, position = locate_coarsely(aids, first, end, work)
         if found:
             std = math.sqrt(max(work.normal[0, 0], work.normal[1, 1], work.normal[2, 2]))
-            note_place(state, position, std, stamp, settings)
-    elif state.last_fix_stamp != NEVER:
-        fix = state.last_fix_ecef
+            note_place(state, position, std, stamp, 0, settings)
+    elif state.last_fix_stamp[0] != NEVER:
+        fix = state.last_fix_ecef[0]
         gather_coarsely(aids, first, end, (fix[0], fix[1], fix[2]), 1, COARSE_STD[1], work)
         if solve_epoch(work):
             step = (work.step[0], work.step[1], work.step[2])

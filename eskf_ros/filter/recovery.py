@@ -242,9 +242,11 @@ def reset(state, source, settings, work):
     """
     covariance = state.covariance
     forget_error(covariance, POSITION)
+    # What lasts in the errors of fixes was taken out of the noise, and is in the position again.
+    whole = 1.0 / (1.0 - settings.correlated_share) if settings.position_error_at < state.error_size else 1.0
     for i in range(3):
         state.position_map[i] += offset_of_track(state, source, i)
-        covariance[POSITION + i, POSITION + i] = max(state.track_offset_variance[source, i], work.noise[i, i])
+        covariance[POSITION + i, POSITION + i] = max(state.track_offset_variance[source, i], whole * work.noise[i, i])
     if not is_fusing(state, GNSS_VELOCITY, source):
         forget_error(covariance, VELOCITY)
         is_led = is_live(state, GNSS_VELOCITY, source)

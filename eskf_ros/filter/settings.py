@@ -185,6 +185,7 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
         settings["gate"][0, stream, 1:] = chdtri([1, 2, 3], 1.0 - probability)
     settings["constrains"][0, Stream.ZUPT] = settings["constrains"][0, Stream.ZARU] = parameters.zupt.enabled
     settings["constrains"][0, Stream.NHC] = parameters.nhc.enabled
+    settings["gnss_covariance_scale"] = parameters.gnss.covariance_scale
     # In mode tight what lasts is in the ranges, and no fix knows of it.
     settings["correlated_share"] = parameters.gnss.correlated_share if parameters.mode == "loose" else 0.0
     describe_vehicle(settings[0], parameters)

@@ -20,7 +20,7 @@ import math
 from eskf_ros.compiled import njit
 from eskf_ros.earth import geodetic_to_ecef
 from eskf_ros.filter.alignment import note_speed
-from eskf_ros.filter.layout import CONSTRAINT_INTERVAL, NEVER, VELOCITY, Stream, Verdict
+from eskf_ros.filter.layout import CONSTRAINT_INTERVAL, NEVER, SOURCES, VELOCITY, Stream, Verdict
 from eskf_ros.rotation import dot
 
 GNSS_POSITION = int(Stream.GNSS_POSITION)
@@ -178,7 +178,8 @@ def learn_from_block(state, settings):
     was_quiet = state.quiet
     state.quiet = 1 if level >= 0.0 and not moved else 0
     if state.quiet != was_quiet:
-        state.quiet_fix_stamp = NEVER
+        for source in range(SOURCES):
+            state.quiet_fix_stamp[source] = NEVER
         state.quiet_pressure_stamp = NEVER
     if level < 0.0:
         return
@@ -252,16 +253,17 @@ def note_displacement(state, aid):
     """Look how far a fix is from the one at which the IMU became quiet, or, until then, from one a few seconds old."""
     fix = geodetic_to_ecef(aid.payload[0], aid.payload[1], aid.payload[2])
     variance = max(aid.payload[3], aid.payload[6], aid.payload[8])
-    age = aid.stamp - state.quiet_fix_stamp
-    if state.quiet_fix_stamp == NEVER or (state.quiet == 0 and age > WAY_LASTS):
-        state.quiet_fix_stamp = aid.stamp
-        state.quiet_fix_variance = variance
+    source = aid.source
+    age = aid.stamp - state.quiet_fix_stamp[source]
+    if state.quiet_fix_stamp[source] == NEVER or (state.quiet == 0 and age > WAY_LASTS):
+        state.quiet_fix_stamp[source] = aid.stamp
+        state.quiet_fix_variance[source] = variance
         for i in range(3):
-            state.quiet_fix_ecef[i] = fix[i]
+            state.quiet_fix_ecef[source, i] = fix[i]
         return
-    start = state.quiet_fix_ecef
+    start = state.quiet_fix_ecef[source]
     way = (fix[0] - start[0], fix[1] - start[1], fix[2] - start[2])
-    distance, std = math.sqrt(dot(way, way)), math.sqrt(variance + state.quiet_fix_variance)
+    distance, std = math.sqrt(dot(way, way)), math.sqrt(variance + state.quiet_fix_variance[source])
     if distance > DISPLACEMENT_SIGMAS * std:
         state.moving_stamp = aid.stamp
     elif state.quiet == 1 and distance < REST_SIGMAS * std and std < WORST_DISPLACEMENT_STD * age * 1e-9:

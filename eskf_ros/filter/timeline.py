@@ -366,8 +366,14 @@ def forget(states, imu, aids, checkpoints, timeline):
 
 @njit
 def raise_barrier(states, blank, timeline):
-    """Make the present the beginning: nothing older is accepted, and nothing rewinds past it. Buffers are emptied."""
+    """Make the present the beginning: nothing older is accepted, and nothing rewinds past it. Buffers are emptied.
+
+    Before the first IMU sample there is no present: what waits stays.
+    """
     t = timeline[0]
+    if t.frontier == NEVER:
+        blank[0] = states[0]
+        return
     states[0].imu_next = 0
     states[0].aid_next = 0
     blank[0] = states[0]

@@ -69,5 +69,6 @@ class DatedEphemerides:
         klobuchar = self._settled_klobuchar
         for message in messages:
             if message.klobuchar:
-                klobuchar = np.frombuffer(message.klobuchar)
+                # A copy, because memory that cannot be written to is another type, for which numba compiles anew.
+                klobuchar = np.frombuffer(message.klobuchar).copy()
         return Ephemerides(np.concatenate([self._settled.records, records])), klobuchar
