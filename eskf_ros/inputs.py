@@ -122,6 +122,8 @@ def _headings(batch: Batch) -> Arguments:
     given = messages["orientation_covariance"]
     covariances[:, 0], covariances[:, 4] = given[:, 8], given[:, 4]
     covariances[given.any(axis=1), 8] = UNMEASURED
+    # Drivers that know the yaw only leave the pitch zero, and its variance.
+    covariances[(given[:, 8] > 0.0) & (given[:, 4] == 0.0), 4] = UNMEASURED
     covariances[given[:, 0] == UNMEASURED] = UNMEASURED
     values[np.abs(x * x + y * y + z * z + w * w - 1.0) > 0.1] = math.nan
     return _vectors(batch, values, covariances)

@@ -307,6 +307,56 @@ def test_swapped_antennas_are_named_when_the_heading_is_known_otherwise() -> Non
     assert abs(heading_error(recording, navigator)) < 4.0
 
 
+@pytest.mark.parametrize("wrong_by", [0.0, 60.0, 180.0])
+@pytest.mark.parametrize("use_velocity", [True, False])
+def test_a_wrong_heading_that_was_given_does_not_stay(wrong_by: float, use_velocity: bool) -> None:
+    """The antennas say so from the first message on; motion decides between them, and then they are fused."""
+    recording = simulate("drive", 6, imu_rate=50.0, stop=90.0, dual_antenna=DualAntenna())
+    w, x, y, z = recording.truth_attitude_body_to_map[0]
+    given = math.degrees(math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))) + wrong_by
+    changes = {"alignment__initial_heading_deg": given, "gnss__use_velocity": use_velocity}
+    navigator = AidedNavigator(recording, **changes)
+    complained = False
+    for _ in feed(recording, navigator, np.arange(499, len(recording.imu_stamp), 500)):
+        complained = complained or any("contradict each other" in sentence for sentence in navigator.complaints)
+    assert complained == (wrong_by != 0.0)
+    assert navigator.restarts == (wrong_by != 0.0)
+    assert abs(heading_error(recording, navigator)) < 4.0
+    assert navigator.status == Status.GOOD
+    assert navigator.complaints == []
+    records = navigator.finish()
+    headings = records[records["stream"] == Stream.HEADING]
+    assert (headings["verdict"][-100:] == Verdict.FUSED).mean() > 0.95
+
+
+@pytest.mark.parametrize("wrong_by", [60.0, 180.0])
+def test_a_pose_with_a_wrong_heading_gives_way_to_antennas_that_were_believed(wrong_by: float) -> None:
+    recording = standing(6, dual_antenna=DualAntenna())
+    navigator = AidedNavigator(recording)
+    posed = False
+    for i, state in feed(recording, navigator, np.arange(0, len(recording.imu_stamp), 10)):
+        if not posed and recording.imu_stamp[i] > recording.imu_stamp[0] + 5 * SECOND:
+            x, y, z, w = np.roll(navigator.odometry[0]["attitude_body_to_map"], -1)
+            yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)) + math.radians(wrong_by)
+            posed = navigator.set_pose(state["position_map"].tolist(), np.eye(3), yaw, 0.1)
+    assert posed
+    assert navigator.restarts == 0
+    assert abs(heading_error(recording, navigator)) < 4.0
+
+
+def test_the_pitch_that_a_driver_leaves_zero_is_none() -> None:
+    """On a slope it would contradict the attitude, and the yaw be refused with it."""
+    (kind,) = (kind for kind in INPUTS if kind.stream == Stream.HEADING)
+    messages = np.zeros(3, message_dtype("sensor_msgs/msg/Imu"))
+    messages["orientation"][:, 3] = 1.0
+    messages["orientation_covariance"][:, 8] = 1e-4
+    messages["orientation_covariance"][1, 4] = 1e-4
+    messages["orientation_covariance"][2] = 0.0
+    covariances = [arguments[2] for arguments in kind.arguments(Batch(np.zeros(3, np.int64), messages, [""]))]
+    assert [covariance[4] for covariance in covariances] == [-1.0, 1e-4, 0.0]
+    assert [covariance[0] for covariance in covariances] == [1e-4, 1e-4, 0.0]
+
+
 def test_swapped_antennas_are_named_when_they_are_the_only_source() -> None:
     _, navigator = swapped()
     assert [sentence for sentence in navigator.complaints if "travels at" in sentence and "180" in sentence]

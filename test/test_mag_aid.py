@@ -361,6 +361,18 @@ def test_the_orientation_of_the_imu_may_start_the_filter(north: str) -> None:
     assert 7.0 < math.degrees(math.sqrt(row["pose_covariance"][5, 5])) < 8.5
 
 
+@pytest.mark.parametrize("variance", [1000.0, math.pi**2, 1.01])
+def test_an_orientation_that_is_unknown_tells_no_heading(variance: float) -> None:
+    """Drivers say with a large variance that they do not know the yaw."""
+    recording = simulate("parked", 3, imu_rate=50.0, stop=10.0)
+    navigator = AidedNavigator(recording, alignment__imu_orientation="true_north")
+    count = len(recording.imu_stamp)
+    covariance = np.tile(np.diag([0.01, 0.01, variance]).ravel(), (count, 1))
+    navigator.push_imu_orientation(recording.imu_stamp, np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), covariance)
+    run_through(recording, navigator)
+    assert navigator.status == Status.WAITING_HEADING
+
+
 def test_an_orientation_nobody_asked_for_is_not_used() -> None:
     recording = simulate("parked", 3, imu_rate=50.0, stop=10.0)
     navigator = AidedNavigator(recording)

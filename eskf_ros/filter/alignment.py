@@ -190,6 +190,7 @@ def restart(state):
     forget_search(state)
     forget_tracks(state)
     state.hint_count = 0
+    state.given_stamp = NEVER
     state.rejected_fixes = 0
     state.recent_resets = 0
     state.level_known = 0
@@ -448,6 +449,7 @@ def level(state, sums, count, interval, still, settings):
     if state.level_known == 0 and state.restarts == 0 and not math.isnan(settings.initial_heading):
         state.heading_known = 1
         set_heading(state, settings.initial_heading, settings.initial_heading_std, settings)
+        state.given_stamp = state.stamp
     state.jump_heading += wrapped(heading_of(state, settings) - heading)
     state.level_known = 1
 
@@ -553,6 +555,8 @@ def set_heading(state, heading, std, settings):
     lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[0])
     change = heading - heading_of(state, settings)
     turn_attitude(state, (change * up[0], change * up[1], change * up[2]))
+    # The vehicle did not make this turn.
+    state.mag_heading = wrapped(state.mag_heading + change)
     covariance = state.covariance
     across = (
         (1.0 - up[0] * up[0], -up[0] * up[1], -up[0] * up[2]),
@@ -619,6 +623,7 @@ def place(state, position, position_covariance, heading, heading_std, settings):
             covariance[POSITION + i, POSITION + j] = position_covariance[i, j]
     state.position_known = 1
     state.heading_known = 1
+    state.given_stamp = state.stamp
 
 
 @njit
@@ -728,3 +733,4 @@ def recall_heading(state, payload, settings):
     forward = rotate_back(state.map_to_ecef, (f[0], f[1], f[2]))
     set_heading(state, math.atan2(forward[1], forward[0]), settings.remembered_heading_std, settings)
     state.heading_known = 1
+    state.given_stamp = state.stamp

@@ -29,7 +29,7 @@ from eskf_ros.filter.layout import CONSTRAINTS, Stream, Verdict
 from eskf_ros.filter.local import note_jump
 from eskf_ros.filter.monitors import watch_course, watch_field, watch_heading
 from eskf_ros.filter.optional import join
-from eskf_ros.filter.recovery import gate_of, recover, watch_solution
+from eskf_ros.filter.recovery import gate_of, note, recover, watch_solution
 from eskf_ros.filter.stillness import note_evidence, watch_wheels
 from eskf_ros.filter.timeline import open_record
 from eskf_ros.filter.track import follow
@@ -91,7 +91,7 @@ def offer(state, aid, heading_before, settings, work):
     if aid.verdict == FUSED and state.heading_known == 0:
         search_heading(state, aid, gate, settings, work)
     if aid.stream == GNSS_POSITION:
-        mag.note_field(state, aid)
+        mag.note_field(state, aid, mag.FIELD)
     elif aid.stream == WHEEL:
         watch_wheels(state, aid)
 
@@ -138,6 +138,7 @@ def measure(state, aid, heading_before, settings, work):
         watch_field(state, is_disturbed)
         if is_disturbed:
             aid.verdict = GATE
+            note(state, MAG, aid.source, GATE)
             return 0
     size = linearize(state, aid, settings, work)
     if size == 0:

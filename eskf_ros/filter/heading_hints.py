@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.alignment import heading_of, set_heading
+from eskf_ros.filter.alignment import START_VELOCITY_STD, heading_of, restart, set_heading
 from eskf_ros.filter.heading_search import turn_found
-from eskf_ros.filter.layout import ERROR_SIZE, GYRO_BIAS, Stream
+from eskf_ros.filter.layout import ERROR_SIZE, GYRO_BIAS, NEVER, VELOCITY, Stream
 from eskf_ros.rotation import wrapped
 
 HEADING = int(Stream.HEADING)
@@ -30,6 +30,13 @@ SILENCE = 5.0
 
 SIGMAS = 3.0
 
+LARGEST_STD = 0.5
+"""What is less certain (rad) does not tell a heading."""
+
+REFUTING_TIME = 5.0
+TRIAL_TIME = 20.0
+"""Rejected headings that agree for so long (s) refute a given one, if they began so soon (s) after it was given."""
+
 OPEN_STD = 1.0
 """The heading is first set with this standard deviation (rad); the update by the message makes it what it is."""
 
@@ -45,12 +52,28 @@ def is_heading_told(state, aid, settings, work):
     rank = MAGNETOMETER
     if aid.stream == HEADING:
         rank = DUAL_ANTENNA if aid.source == 0 else IMU_ORIENTATION
+    if rank == DUAL_ANTENNA and state.heading_disputed == 1:
+        return False
     turn, std = work.innovation[0], math.sqrt(work.noise[0, 0])
     if rank == DUAL_ANTENNA and settings.heading_offset_at < state.error_size:
         std = math.hypot(std, settings.optional_std[settings.heading_offset_at - ERROR_SIZE])
     if rank == MAGNETOMETER:
         std = math.hypot(std, settings.optional_std[settings.mag_error_at - ERROR_SIZE])
-    age = (aid.stamp - state.hint_stamp) * 1e-9
+    if std > LARGEST_STD or not do_agree(state, aid.stamp, rank, turn, std, SHORTEST_TIME[rank]):
+        return False
+    found, found_std = turn_found(state)
+    if abs(wrapped(turn - found)) > SIGMAS * math.sqrt(std**2 + found_std**2):
+        return False
+    set_heading(state, heading_of(state, settings) + turn, OPEN_STD, settings)
+    state.heading_known = 1
+    state.mag_heading = heading_of(state, settings)
+    return True
+
+
+@njit
+def do_agree(state, stamp, rank, turn, std, shortest_time):
+    """Say whether enough messages in a row, this one the last, would turn the attitude alike (rad)."""
+    age = (stamp - state.hint_stamp) * 1e-9
     if state.hint_count > 0 and rank > state.hint_rank and age < SILENCE:
         return False
     bias_variance = 0.0
@@ -58,26 +81,54 @@ def is_heading_told(state, aid, settings, work):
         bias_variance = max(bias_variance, state.covariance[GYRO_BIAS + i, GYRO_BIAS + i])
     drift = math.sqrt(bias_variance) * age
     tolerance = SIGMAS * math.sqrt(std**2 + state.hint_std**2 + drift**2)
-    if (
-        state.hint_count == 0
-        or rank != state.hint_rank
-        or age > SILENCE
-        or abs(wrapped(turn - state.hint_turn)) > tolerance
-    ):
+    is_other = abs(wrapped(turn - state.hint_turn)) > tolerance
+    if state.hint_count == 0 or rank != state.hint_rank or age > SILENCE or is_other:
         state.hint_count = 0
-        state.hint_since = aid.stamp
+        state.hint_since = stamp
     state.hint_rank = rank
     state.hint_count += 1
-    state.hint_stamp = aid.stamp
+    state.hint_stamp = stamp
     state.hint_turn = turn
     state.hint_std = std
-    if state.hint_count < MESSAGES or (aid.stamp - state.hint_since) * 1e-9 < SHORTEST_TIME[rank]:
+    return state.hint_count >= MESSAGES and (stamp - state.hint_since) * 1e-9 >= shortest_time
+
+
+@njit
+def is_given_heading_refuted(state, aid, settings, work):
+    """Consider a heading of the dual antenna that was rejected; say whether it refutes a heading that was given.
+
+    A parameter, a memory or a pose may be wrong, and a filter that trusts them rejects for ever the sensor that knows
+    better. So what was given holds only if the antennas are heard to agree with it, and not if those that were rejected
+    from the beginning agree with each other.
+    """
+    is_doubtful = state.given_stamp != NEVER and state.aid_fused_stamp[HEADING, 0] < state.given_stamp
+    if not is_doubtful or aid.source != 0 or not aid.payload[3] > 0.0:
         return False
-    found, found_std = turn_found(state)
-    if abs(wrapped(turn - found)) > SIGMAS * math.sqrt(std**2 + found_std**2):
+    std = math.sqrt(aid.payload[3])
+    if not do_agree(state, aid.stamp, DUAL_ANTENNA, work.innovation[0], std, REFUTING_TIME):
         return False
-    set_heading(state, heading_of(state, settings) + turn, OPEN_STD, settings)
-    state.heading_known = 1
-    # This turn is none that the vehicle made.
-    state.mag_heading = heading_of(state, settings)
+    return (state.hint_since - state.given_stamp) * 1e-9 < TRIAL_TIME
+
+
+@njit
+def take_back_heading(state, aid, settings, work):
+    """Take the heading of the antennas, if they were believed before, else none: antennas may be swapped, too.
+
+    Then only motion decides. The velocity, led astray meanwhile, is open. Returns whether the antennas have won.
+    """
+    state.given_stamp = NEVER
+    state.hint_count = 0
+    if state.aid_fused_stamp[HEADING, 0] == NEVER:
+        restart(state)
+        state.heading_disputed = 1
+        return False
+    std = math.sqrt(aid.payload[3])
+    if settings.heading_offset_at < state.error_size:
+        std = math.hypot(std, settings.optional_std[settings.heading_offset_at - ERROR_SIZE])
+    set_heading(state, heading_of(state, settings) + work.innovation[0], std, settings)
+    for i in range(VELOCITY, VELOCITY + 3):
+        for j in range(len(state.covariance)):
+            state.covariance[i, j] = 0.0
+            state.covariance[j, i] = 0.0
+        state.covariance[i, i] = START_VELOCITY_STD**2
     return True

@@ -214,6 +214,9 @@ STATE = np.dtype(
         ("hint_stamp", "i8"),
         ("hint_turn", "f8"),
         ("hint_std", "f8"),
+        # When a heading was given: by parameter, from memory, or by a pose; whether the dual antenna contradicts it.
+        ("given_stamp", "i8"),
+        ("heading_disputed", "i8"),
         # External evidence of motion: when GNSS last proved it; by receiver, whose antennas are apart, the last fix and
         # the one the window started from.
         ("motion_stamp", "i8"),
@@ -368,7 +371,7 @@ STATE = np.dtype(
 
 IMU = np.dtype([("stamp", "i8"), ("specific_force", "f8", (3,)), ("angular_rate", "f8", (3,))], align=True)
 
-PAYLOAD_SIZE = 21
+PAYLOAD_SIZE = 25
 AID = np.dtype(
     [
         ("stamp", "i8"),
@@ -609,6 +612,7 @@ def allocate(dtype: np.dtype, count: int = 1) -> np.ndarray:
 
 
 _EVIDENCE = (
+    "given_stamp",
     "still_stamp",
     "motion_stamp",
     "last_fix_stamp",

@@ -8,7 +8,7 @@ import numpy as np
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import STANDARD_GRAVITY
-from eskf_ros.filter.layout import Stream
+from eskf_ros.filter.layout import NEVER, Stream
 from eskf_ros.filter.sway import can_be_bias
 from eskf_ros.rotation import dot, rotate, wrapped
 
@@ -33,6 +33,14 @@ ALIKE = 0.9
 FAR_OFF_DEG = 30.0
 """Angles are remembered for some hundred messages; at least so many, so much alike, and on average so far from zero
 are no accident."""
+
+LONG_REFUSED = 30.0
+REFUSED_CAUSES = {
+    Stream.WHEEL: "wheel.time_offset, wheel.position, the scale of the speed (estimate.wheel_scale), or slip",
+    Stream.BODY_VELOCITY: "body_velocity.mount_rpy_deg, body_velocity.mount_position, body_velocity.time_offset, or "
+    "covariances that claim too much",
+}
+"""What may be wrong with velocities that are refused for so long (s) while they come."""
 
 
 @njit
@@ -119,6 +127,23 @@ def _lasting_difference(sums: np.ndarray) -> float | None:
     return mean if abs(mean) > FAR_OFF_DEG else None
 
 
+def is_heading_contradicted(state: np.void) -> bool:
+    """Say whether the dual antenna or the magnetometer tell another heading than the estimate for long."""
+    return any(_lasting_difference(sums) is not None for sums in state["heading_contrast"])
+
+
+def _refused_complaints(state: np.void) -> list[str]:
+    """Name the aids that are refused without end: one sentence each."""
+    found = []
+    for stream, causes in REFUSED_CAUSES.items():
+        count = int(state["aid_rejected"][stream, 0])
+        since = (int(state["stamp"]) - int(state["aid_fused_stamp"][stream, 0])) * 1e-9
+        last = (int(state["stamp"]) - int(state["aid_stamp"][stream, 0])) * 1e-9
+        if count > LASTING_COUNT and since > LONG_REFUSED > last:
+            found.append(f"{count} messages of {stream.name.lower()} in a row contradict the estimate: {causes}")
+    return found
+
+
 def _heading_complaints(state: np.void) -> list[str]:
     found = []
     if state["disturbed_fields"] > max(LASTING_COUNT, ALIKE * float(state["fields"])):
@@ -129,18 +154,26 @@ def _heading_complaints(state: np.void) -> list[str]:
             f"{math.degrees(state['field_inclination']):.0f} deg: does mag.mount_rpy_deg match its axes (a driver may "
             "give north-east-down), is it in T, and is it calibrated?"
         )
+    if state["heading_disputed"] and not state["heading_known"]:
+        found.append(
+            "the dual antenna and the heading that was given (alignment.initial_heading_deg, warm start, initialpose) "
+            "contradict each other: which one is right is known when the robot speeds up or turns"
+        )
     dual_antenna, magnetometer = state["heading_contrast"]
+    given = ""
+    if state["given_stamp"] != NEVER:
+        given = " Or is the heading wrong that was given (alignment.initial_heading_deg, warm start, initialpose)?"
     difference = _lasting_difference(magnetometer)
     if difference is not None:
         found.append(
             f"the headings of the magnetometer differ from the estimate by {difference:.0f} deg: does "
-            "mag.mount_rpy_deg match its axes (a driver may give north-east-down), and is it calibrated?"
+            "mag.mount_rpy_deg match its axes (a driver may give north-east-down), and is it calibrated?" + given
         )
     difference = _lasting_difference(dual_antenna)
     if difference is not None:
         found.append(
             f"the headings of the dual antenna differ from the estimate by {difference:.0f} deg: are the antennas "
-            "swapped, does heading.mount_rpy_deg match the baseline, and is yaw 0 = east, counter-clockwise?"
+            "swapped, does heading.mount_rpy_deg match the baseline, and is yaw 0 = east, counter-clockwise?" + given
         )
     difference = _lasting_difference(state["course_contrast"])
     if difference is not None and dual_antenna[2] > 0.0:
@@ -179,4 +212,4 @@ def complaints(state: np.void) -> list[str]:
         found.append(
             f"the gyro reads more than {FASTEST_TURN:.0f} rad/s for seconds: is it in deg/s? REP-103 wants rad/s"
         )
-    return found + _heading_complaints(state)
+    return found + _heading_complaints(state) + _refused_complaints(state)

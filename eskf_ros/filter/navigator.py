@@ -42,11 +42,11 @@ from eskf_ros.filter.layout import (
     blank_state,
 )
 from eskf_ros.filter.local import carry, measure_step, note_jump
-from eskf_ros.filter.monitors import complaints
+from eskf_ros.filter.monitors import complaints, is_heading_contradicted
 from eskf_ros.filter.output import status_of, write_odometry
 from eskf_ros.filter.ranges import end_of_epoch, fuse_ranges, is_range, offer_signals
 from eskf_ros.filter.recovery import phase_of
-from eskf_ros.filter.settings import intakes_from, settings_from
+from eskf_ros.filter.settings import UNKNOWN_ANGLE_VARIANCE, intakes_from, settings_from
 from eskf_ros.filter.stillness import add_to_block
 from eskf_ros.filter.strapdown import SECOND, propagate
 from eskf_ros.filter.sway import add_to_part
@@ -102,6 +102,8 @@ DOOR_REMEDIES = {
 """What is said when most messages of a stream are refused for what they contain."""
 
 FEWEST_REFUSED = 10
+
+NO_FIELD = (0.0, 0.0, 0.0, 0.0)
 
 NO_STAND_IN = (0.0, 0.0, 0.0)
 """The covariance of a message is its own."""
@@ -222,7 +224,7 @@ class Navigator:
         self._settings = settings_from(parameters, self._output_rate)
         self._constraint_count = int(self._settings["constrains"].sum())
         self._intakes = intakes_from(parameters)
-        self._needs_field = parameters.mag.use or parameters.alignment.imu_orientation == "magnetic_north"
+        self.needs_field = parameters.mag.use or parameters.alignment.imu_orientation == "magnetic_north"
         if self._memory is not None:
             recall(*self._memory, parameters, self._settings[0])
 
@@ -378,8 +380,9 @@ class Navigator:
                 door = NO_FIX
             elif abs(latitude_deg) > 90.0 or abs(longitude_deg) > 360.0 or abs(altitude) > HIGHEST_ALTITUDE:
                 door = BAD_VALUE
-            elif self._needs_field:
-                self._add_field(latitude_deg, longitude_deg, altitude, stamp)
+            elif self.needs_field:
+                field = self._field_at(latitude_deg, longitude_deg, altitude, stamp)
+                self._offered[0]["payload"][mag.FIELD : mag.FIELD + 4] = field
         self._push_gnss(Stream.GNSS_POSITION, stamp, arrival, frame_id, door)
 
     def push_gnss_velocity(
@@ -421,13 +424,16 @@ class Navigator:
         signals: np.ndarray,
         klobuchar: FloatArray = NO_KLOBUCHAR,
         arrival: int = 0,
+        place: tuple[float, float, float] | None = None,
     ) -> None:
         """Take the signals (MEASURED_SIGNAL, `gnss.measurements.measured_epoch`) of one epoch of the first receiver.
 
         ``stamp``: the instant of the measurement on the IMU's clock; ``instant``: the same in GPS time, to a minute;
         ``klobuchar``: eight parameters of the ionosphere. The signals have been measured without a position, so that
-        they do not depend on when they come.
+        they do not depend on when they come. ``place``: where the epoch alone puts the antenna (deg, deg, m), as good
+        as the Earth's magnetic field needs it (``needs_field``): now and then is enough.
         """
+        field = NO_FIELD if place is None or not self.needs_field else self._field_at(*place, stamp)
         self.range_statuses.update(status_counts(signals))
         is_tight, ranges = self.parameters.mode == "tight", self.parameters.ranges
         code_door = Verdict.WAITING if is_tight and ranges.use else Verdict.DISABLED
@@ -444,6 +450,7 @@ class Navigator:
             arrival,
             instant[0] * SECONDS_PER_WEEK + instant[1],
             klobuchar,
+            np.array(field),
             int(code_door),
             int(rate_door),
             refused,
@@ -465,7 +472,7 @@ class Navigator:
         if alignment.imu_orientation == "unused":
             return
         forward_imu = self._settings["imu_to_base"][0, 0]
-        for i in np.flatnonzero(covariance[:, 0] != ABSENT):
+        for i in np.flatnonzero((covariance[:, 0] != ABSENT) & (covariance[:, 8] <= UNKNOWN_ANGLE_VARIANCE)):
             stamp = int(stamps[i])
             if stamp % SECOND >= ORIENTATION_SHARE:
                 continue
@@ -579,7 +586,11 @@ class Navigator:
     @property
     def complaints(self) -> list[str]:
         """What is wrong with whole streams, one sentence each with what to do; empty when nothing is."""
-        found = complaints(self._states[0]) + aid_complaints(self._states[0], self._settings[0])
+        state = self._states[0]
+        found = complaints(state)
+        # With a wrong heading the fixes seem to be wrong in many ways, which then mean nothing.
+        if not is_heading_contradicted(state):
+            found += aid_complaints(state, self._settings[0])
         if self._field_problem:
             found.append(self._field_problem)
         for (stream, verdict), count in self._shut_doors.items():
@@ -643,19 +654,21 @@ class Navigator:
             self._stand_ins += 1
         return OPEN_DOOR
 
-    def _add_field(self, latitude_deg: float, longitude_deg: float, altitude: float, stamp: int) -> None:
-        """Write the Earth's magnetic field at a fix, a function of the fix alone, to the record that is on offer."""
+    def _field_at(
+        self, latitude_deg: float, longitude_deg: float, altitude: float, stamp: int
+    ) -> tuple[float, float, float, float]:
+        """Return the Earth's magnetic field at a fix, a function of the fix alone, as `mag.note_field` wants it."""
         declination = math.radians(self.parameters.mag.declination_deg)
         try:
             found, inclination, strength = field_at(latitude_deg, longitude_deg, altitude, stamp)
         except FieldUnknown as problem:
             if math.isnan(declination):
                 self._field_problem = str(problem)
-                return
+                return NO_FIELD
             found, inclination, strength = declination, 0.0, 0.0
         if math.isnan(declination):
             declination = found
-        self._offered[0]["payload"][mag.FIELD : mag.FIELD + 4] = (1.0, declination, inclination, strength)
+        return 1.0, declination, inclination, strength
 
     def _push_gnss(self, stream: Stream, stamp: int, arrival: int, frame_id: str, door: int) -> None:
         """Sort the record that is on offer into the timeline, as one of the receiver with this frame."""

@@ -21,12 +21,13 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import SEMI_MAJOR_AXIS, ecef_to_geodetic
-from eskf_ros.filter.aiding import pseudorange, range_rate
+from eskf_ros.filter.aiding import mag, pseudorange, range_rate
 from eskf_ros.filter.aiding.gnss_velocity import body_rate
 from eskf_ros.filter.aiding.pseudorange import offset_place
 from eskf_ros.filter.aiding.signal import (
     CARRIER,
     CN0,
+    FIELD,
     FLAGS,
     GPS_TIME,
     KLOBUCHAR,
@@ -122,11 +123,14 @@ REWEIGHTINGS = 20
 
 
 @njit
-def offer_signals(aids, timeline, offered, signals, stamp, arrival, gps_time, klobuchar, code_door, rate_door, refused):
+def offer_signals(
+    aids, timeline, offered, signals, stamp, arrival, gps_time, klobuchar, field, code_door, rate_door, refused
+):
     """Sort the usable signals (MEASURED_SIGNAL) of one epoch into the timeline, which has room for two of each.
 
-    ``gps_time``: s since 6 January 1980, ``klobuchar``: parameters of the ionosphere (8,). Returns how many never
-    enter; ``refused`` (RECORD) says which and why.
+    ``gps_time``: s since 6 January 1980, ``klobuchar``: parameters of the ionosphere (8,), ``field``: the Earth's
+    magnetic field there as `mag.note_field` wants it, zeros if unknown. Returns how many never enter; ``refused``
+    (RECORD) says which and why.
     """
     payload = offered[0].payload
     count = 0
@@ -154,6 +158,7 @@ def offer_signals(aids, timeline, offered, signals, stamp, arrival, gps_time, kl
             if door == WAITING:
                 door = judge_signal(payload)
             payload[KLOBUCHAR : KLOBUCHAR + 8] = klobuchar
+            payload[FIELD : FIELD + 4] = field
             verdict = offer_aid(aids, timeline, offered, stamp, arrival, stream, source, door)
             if verdict != WAITING:
                 record = refused[count]
@@ -237,6 +242,7 @@ def offer_epoch(state, aids, first, end, which, settings, work):
             fuse_signal(state, aids[i], settings, work)
             if aids[i].verdict in (FUSED, WEIGHED_DOWN):
                 fused += 1
+                mag.note_field(state, aids[i], FIELD)
     if which == 0 and fused >= FEWEST_TO_SOLVE:
         note_epoch(state, FUSED)
     elif which == 0 and work.signal_count >= FEWEST_TO_JUDGE and 2 * fused < work.signal_count:

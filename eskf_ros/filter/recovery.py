@@ -10,6 +10,8 @@ The track of a receiver (see ``track``) answers that without the filter's own op
 A fix not far outside the gate corrects a little: where the IMU was worse than its parameters say, a filter that ignores
 the first fix outside the gate ignores all that follow, because its error and its sigma grow alike.
 
+A heading that was given does not hold against a dual antenna that it was never reconciled with (``heading_hints``).
+
 A receiver whose accuracy changes at once has another kind of solution (single, float, fixed), and what lasted in the
 error of the old one says nothing about the new one.
 """
@@ -20,6 +22,7 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment import START_VELOCITY_STD, restart
+from eskf_ros.filter.heading_hints import is_given_heading_refuted, take_back_heading
 from eskf_ros.filter.layout import (
     ERROR_CAPACITY,
     NEVER,
@@ -37,6 +40,7 @@ from eskf_ros.filter.update import project, update
 
 GNSS_POSITION = int(Stream.GNSS_POSITION)
 GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
+HEADING = int(Stream.HEADING)
 BARO = int(Stream.BARO)
 PSEUDORANGE = int(Stream.PSEUDORANGE)
 
@@ -144,6 +148,11 @@ def recover(state, aid, size, gate, settings, work):
         elif aid.nis <= NEAR_GATE * gate:
             update_weighed_down(state, size, aid.nis / gate, work)
             aid.verdict = WEIGHED_DOWN
+    elif stream == HEADING and aid.verdict == GATE and is_given_heading_refuted(state, aid, settings, work):
+        if take_back_heading(state, aid, settings, work):
+            aid.verdict = RESET
+    elif stream == HEADING and aid.verdict == FUSED:
+        state.heading_disputed = 0
     is_lasting = state.stamp - state.aid_fused_stamp[stream, source] > REJECTED_PRESSURE
     if stream == BARO and aid.verdict == GATE and is_lasting:
         renew(state, settings.baro_offset_at, 1, settings)

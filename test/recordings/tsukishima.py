@@ -102,6 +102,8 @@ NOISE = """\
 REAR_AXLE = ("wheel.position: [-1.2, 0.0, 0.0]", "nhc.position: [-1.2, 0.0, 0.0]")
 
 RANGES_NOISE = """\
+    # No parameters of the ionosphere for the day.
+    ranges.correlated_std_vertical: 5.0
     imu.accel_bias_std: 0.5
     imu.accel_bias_random_walk: 1.0e-3
     imu.gyro_noise_density: 7.0e-4

@@ -148,10 +148,10 @@ def note_way(state, heading, settings):
 
 
 @njit
-def note_field(state, aid):
-    """Remember the Earth's field at a good fix, which carries it at the end of its payload (see ``navigator``)."""
-    if aid.verdict == FUSED and aid.payload[FIELD] > 0.0:
-        state.field_declination = aid.payload[FIELD + 1]
-        state.field_inclination = aid.payload[FIELD + 2]
-        state.field_strength = aid.payload[FIELD + 3]
+def note_field(state, aid, place):
+    """Remember the Earth's field at a good fix or range, which carries it from ``place`` of its payload on."""
+    if aid.verdict == FUSED and aid.payload[place] > 0.0:
+        state.field_declination = aid.payload[place + 1]
+        state.field_inclination = aid.payload[place + 2]
+        state.field_strength = aid.payload[place + 3]
         state.field_known = 1

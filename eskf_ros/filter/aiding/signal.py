@@ -26,6 +26,7 @@ CN0 = 10
 NOISE_FACTOR = 11
 GPS_TIME = 12
 KLOBUCHAR = 13
+FIELD = 21
 
 LETTER_OF = {int(gnss): letter for letter, gnss in LETTERS.items()}
 
