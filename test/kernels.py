@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter import layout, strapdown
-from eskf_ros.filter.alignment import set_datum
 from eskf_ros.filter.layout import NEVER
+from eskf_ros.filter.local_frame import set_datum
 from eskf_ros.filter.navigator import take_sample
 from eskf_ros.filter.settings import settings_from
 from eskf_ros.parameters import from_mapping

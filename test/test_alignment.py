@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from eskf_ros.filter import alignment
+from eskf_ros.filter import alignment, heading_start, level, local_frame, still_window
 from eskf_ros.filter.aiding import gnss_position
 from eskf_ros.filter.layout import AID, NEVER, allocate, blank_state
 from eskf_ros.filter.strapdown import gravity_map
@@ -53,7 +53,7 @@ def fresh(datum: tuple[float, float, float] | None = DATUM) -> Any:
     """Return a filter that has seen nothing but, perhaps, its datum."""
     state = blank_state()[0]
     if datum is not None:
-        alignment.set_datum(state, math.radians(datum[0]), math.radians(datum[1]), datum[2])
+        local_frame.set_datum(state, math.radians(datum[0]), math.radians(datum[1]), datum[2])
     return state
 
 
@@ -64,8 +64,8 @@ def at_rest(state: Any, attitude: Rotation, accel_bias: Any, gyro_bias: Any) -> 
     return attitude.inv().apply(-gravity) + accel_bias, attitude.inv().apply(turning) + gyro_bias
 
 
-def level(state: Any, force: Array, rate: Array, settings: Any, still: bool = True) -> None:
-    alignment.level(state, COUNT * np.concatenate([force, rate]), COUNT, 1.0 / RATE_HZ, still, settings)
+def level_with(state: Any, force: Array, rate: Array, settings: Any, still: bool = True) -> None:
+    level.level(state, COUNT * np.concatenate([force, rate]), COUNT, 1.0 / RATE_HZ, still, settings)
 
 
 def mean_noise(rng: np.random.Generator, settings: Any, sensor: str) -> Array:
@@ -78,7 +78,7 @@ def mean_noise(rng: np.random.Generator, settings: Any, sensor: str) -> Array:
 
 def tilt_error(state: Any, attitude: Rotation) -> Array:
     """Return the horizontal part of theta in R_true = exp(theta) R, whatever the heading of either."""
-    up = np.array(alignment.local_up(state))
+    up = np.array(local_frame.local_up(state))
     true_up_body = attitude.inv().apply(up)
     return np.cross(to_rotation(state["attitude"]).apply(true_up_body), up)
 
@@ -99,8 +99,8 @@ def test_tilt_error_is_what_the_accelerometer_bias_makes_of_it(seed: int, still:
     attitude = Rotation.random(random_state=seed)
     bias = rng.normal(0.0, 0.05, 3)
     state = fresh()
-    level(state, *at_rest(state, attitude, bias, np.zeros(3)), make_settings(**MOUNT), still)
-    up = np.array(alignment.local_up(state))
+    level_with(state, *at_rest(state, attitude, bias, np.zeros(3)), make_settings(**MOUNT), still)
+    up = np.array(local_frame.local_up(state))
     expected = np.cross(up, to_rotation(state["attitude"]).apply(bias)) / 9.81
     # To the second order in bias over gravity.
     np.testing.assert_allclose(tilt_error(state, attitude), expected, rtol=0.0, atol=3.0 * (0.1 / 9.8) ** 2)
@@ -114,7 +114,7 @@ def test_tilt_error_is_what_the_accelerometer_bias_makes_of_it(seed: int, still:
 def test_mounted_upside_down(axis: tuple[float, float, float], angle: float) -> None:
     attitude = Rotation.from_rotvec(math.radians(angle) * np.array(axis))
     state = fresh(None)
-    level(state, *at_rest(state, attitude, np.zeros(3), np.zeros(3)), make_settings())
+    level_with(state, *at_rest(state, attitude, np.zeros(3), np.zeros(3)), make_settings())
     assert np.linalg.norm(tilt_error(state, attitude)) < 2e-9
     true_up_body = attitude.inv().apply([0.0, 0.0, 1.0])
     np.testing.assert_allclose(to_rotation(state["attitude"]).apply(true_up_body), (0, 0, 1), rtol=0.0, atol=2e-9)
@@ -123,7 +123,7 @@ def test_mounted_upside_down(axis: tuple[float, float, float], angle: float) -> 
 @pytest.mark.parametrize("a", [(0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (0.6, 0.8, 0.0), (0.0, -0.6, 0.8)])
 def test_turn_into_the_exact_opposite(a: tuple[float, float, float]) -> None:
     opposite = tuple(-c for c in a)
-    turn = alignment.shortest_turn(a, opposite)
+    turn = local_frame.shortest_turn(a, opposite)
     assert np.linalg.norm(turn) == pytest.approx(math.pi, abs=1e-12)
     np.testing.assert_allclose(Rotation.from_rotvec(turn).apply(a), opposite, rtol=0.0, atol=1e-12)
 
@@ -138,7 +138,7 @@ def test_level_draws_match_their_covariance() -> None:
         bias = rng.normal(0.0, settings["accel_bias_std"], 3)
         state = fresh()
         force, rate = at_rest(state, attitude, bias, np.zeros(3))
-        level(state, force + mean_noise(rng, settings, "accel"), rate, settings)
+        level_with(state, force + mean_noise(rng, settings, "accel"), rate, settings)
         chosen = [6, 7, 9, 10, 11]
         covariance = core(state)[np.ix_(chosen, chosen)]
         assert np.linalg.eigvalsh(covariance).min() > 0.0
@@ -170,16 +170,16 @@ def test_gyro_bias_is_the_bayesian_posterior(seed: int, case: str) -> None:
     attitude = Rotation.random(random_state=seed)
     state = fresh(None if case == "no datum" else DATUM)
     force, rate = at_rest(state, attitude, np.zeros(3), np.random.default_rng(seed).normal(0.0, 1e-4, 3))
-    level(state, force, rate, settings, still=case != "moving")
+    level_with(state, force, rate, settings, still=case != "moving")
     if case == "heading known":
         # The first levelling takes the heading; the second knows where the Earth's rate points.
-        level(state, force, rate, settings)
+        level_with(state, force, rate, settings)
 
     earth_rate = 7.292115e-5
     duration = COUNT / RATE_HZ
     noise = settings["gyro_noise_density"] ** 2 / duration + settings["gyro_bias_random_walk"] ** 2 * duration / 3.0
     to_body = to_rotation(state["attitude"]).inv().as_matrix()
-    up = np.array(alignment.local_up(state))
+    up = np.array(local_frame.local_up(state))
     earth = np.array(state["earth_rate_map"])
     across = np.eye(3) - np.outer(up, up)
     # A rate of known size and unknown direction has half of its square on each of two axes.
@@ -207,7 +207,7 @@ def test_gyro_bias_draws_are_within_their_covariance(gyro_bias_std: float) -> No
         bias = rng.normal(0.0, gyro_bias_std, 3)
         state = fresh()
         force, rate = at_rest(state, attitude, np.zeros(3), bias)
-        level(state, force, rate + mean_noise(rng, settings, "gyro"), settings)
+        level_with(state, force, rate + mean_noise(rng, settings, "gyro"), settings)
         to_map = to_rotation(state["attitude"]).as_matrix()
         error = to_map @ (bias - state["gyro_bias"])
         covariance = to_map @ core(state)[12:, 12:] @ to_map.T
@@ -227,11 +227,11 @@ def test_heading_is_that_of_base_link_with_any_mount(seed: int, heading_deg: flo
     base = Rotation.from_euler("xyz", [4.0, -7.0, 40.0 * seed], degrees=True)
     mount = Rotation.from_euler("xyz", MOUNT["imu__mount_rpy_deg"], degrees=True)
     state = make_state((0.0, 0.0, 3.0), attitude=base * mount)
-    assert alignment.heading_of(state, settings) == pytest.approx(
+    assert heading_start.heading_of(state, settings) == pytest.approx(
         math.remainder(math.radians(40.0 * seed), 2.0 * math.pi), abs=1e-12
     )
     before = copy_of(state)
-    alignment.set_heading(state, math.radians(heading_deg), 0.1, settings)
+    heading_start.set_heading(state, math.radians(heading_deg), 0.1, settings)
     expected = Rotation.from_euler("xyz", [4.0, -7.0, heading_deg], degrees=True)
     turned = to_rotation(state["attitude"]) * mount.inv()
     # The plumb line at the datum's altitude leans against map's z by a microradian.
@@ -252,11 +252,11 @@ def test_set_heading_turns_the_tilt_error_with_the_attitude(seed: int) -> None:
     truth = Rotation.from_rotvec(theta) * to_rotation(state["attitude"])
     np.testing.assert_allclose(tilt_error(state, truth), theta, rtol=0.0, atol=5e-6)
     std = 0.05
-    alignment.set_heading(state, 2.0, std, settings)
+    heading_start.set_heading(state, 2.0, std, settings)
     turn = to_rotation(state["attitude"]) * to_rotation(before["attitude"]).inv()
     # What is true has not moved: its tilt, seen from the new attitude, has.
     np.testing.assert_allclose(tilt_error(state, truth), turn.apply(theta), rtol=0.0, atol=5e-6)
-    up = np.array(alignment.local_up(before))
+    up = np.array(local_frame.local_up(before))
     full = np.eye(15)
     full[6:9, 6:9] = (np.eye(3) - np.outer(up, up)) @ turn.as_matrix()
     expected = full @ core(before) @ full.T
@@ -279,7 +279,7 @@ def test_level_and_heading_draws_match_their_covariance() -> None:
         bias = rng.normal(0.0, settings["accel_bias_std"], 3)
         state = fresh()
         force, rate = at_rest(state, attitude, bias, np.zeros(3))
-        level(state, force + mean_noise(rng, settings, "accel"), rate, settings)
+        level_with(state, force + mean_noise(rng, settings, "accel"), rate, settings)
         assert state["heading_known"] == 1
         theta = (attitude * to_rotation(state["attitude"]).inv()).as_rotvec()
         error = np.concatenate([theta, bias])
@@ -317,9 +317,9 @@ def test_course_alignment_is_as_good_as_it_says() -> None:
         velocity = speed * np.array([math.cos(course), math.sin(course)])
         velocity = velocity + rng.multivariate_normal([0.0, 0.0], covariance)
         state = driving((*velocity, 0.0), covariance, heading)
-        alignment.align_to_course(state, settings)
+        heading_start.align_to_course(state, settings)
         assert state["heading_known"] == 1
-        off = math.remainder(heading - alignment.heading_of(state, settings), 2.0 * math.pi)
+        off = math.remainder(heading - heading_start.heading_of(state, settings), 2.0 * math.pi)
         normalized.append(off**2 / core(state)[8, 8])
     assert_chi_square(normalized, 1)
 
@@ -344,7 +344,7 @@ def test_course_is_taken_only_when_it_means_something(
     state = driving(velocity, std**2 * np.eye(2))
     state["angular_rate"] = (0.0, 0.0, turn_rate)
     before = copy_of(state)
-    alignment.align_to_course(state, settings)
+    heading_start.align_to_course(state, settings)
     assert bool(state["heading_known"]) == aligned
     if not aligned:
         np.testing.assert_array_equal(state["attitude"], before["attitude"])
@@ -368,10 +368,10 @@ def test_the_course_sharpens_what_the_accelerations_have_decided(
 ) -> None:
     settings = make_settings()
     state = driving((8.0, 0.0, 0.0), 0.01 * np.eye(2), math.radians(heading_deg), search_std)
-    alignment.align_to_course(state, settings)
+    heading_start.align_to_course(state, settings)
     assert bool(state["heading_known"]) == (found_deg is not None)
     if found_deg is not None:
-        off = alignment.heading_of(state, settings) - math.radians(found_deg)
+        off = heading_start.heading_of(state, settings) - math.radians(found_deg)
         assert math.remainder(off, math.tau) == pytest.approx(0.0, abs=1e-9)
 
 
@@ -384,7 +384,7 @@ def watch(state: Any, settings: Any, seconds: float, force: Any, rate: Any, shak
         state["stamp"] += 10_000_000
         state["specific_force"] = np.array(force) + (shaking * math.sin(0.9 * k), 0.0, 0.0)
         state["angular_rate"] = rate
-        alignment.watch_stillness(state, settings)
+        still_window.watch_stillness(state, settings)
 
 
 def waiting() -> Any:
@@ -495,7 +495,7 @@ def distrusting(robots: int, std: float, speed: float = 0.0) -> int:
             longitude = math.radians(DATUM[1]) + east / (6.378e6 * math.cos(latitude))
             aid["stamp"] = round(seconds * 1e9)
             aid["payload"][:9] = (latitude, longitude, DATUM[2] + up, std**2, 0.0, 0.0, std**2, 0.0, std**2)
-            alignment.note_position(state, aid, settings)
+            still_window.note_position(state, aid, settings)
             if state["motion_stamp"] > 0 and state["still_stamp"] == NEVER:
                 found += 1
                 break
@@ -523,7 +523,7 @@ def test_first_fix_starts_the_position() -> None:
     settings = make_settings()
     state = fresh(None)
     attitude = Rotation.from_euler("xyz", [0.3, -0.2, 0.0])
-    level(state, *at_rest(state, attitude, np.zeros(3), np.zeros(3)), settings)
+    level_with(state, *at_rest(state, attitude, np.zeros(3), np.zeros(3)), settings)
     payload = np.array([math.radians(48.0), math.radians(11.0), 500.0, 1.0, 0.0, 0.0, 1.0, 0.0, 4.0])
     alignment.start_position(state, payload)
     assert (state["datum_known"], state["position_known"]) == (1, 1)
@@ -543,10 +543,10 @@ def test_far_datum_levels_along_the_local_vertical() -> None:
     attitude = Rotation.from_euler("xyz", [0.1, 0.0, 1.0])
     # Level first, along map's z as far as is known; the fix then tells where the robot is.
     force = attitude.inv().apply([0.0, 0.0, 9.81])
-    level(state, force, np.zeros(3), settings)
+    level_with(state, force, np.zeros(3), settings)
     payload = np.array([math.radians(52.5), math.radians(11.0), 80.0, 1.0, 0.0, 0.0, 1.0, 0.0, 4.0])
     alignment.start_position(state, payload)
-    up = np.array(alignment.local_up(state))
+    up = np.array(local_frame.local_up(state))
     assert math.degrees(math.acos(up[2])) == pytest.approx(4.5, abs=0.02)
     measured_up = to_rotation(state["attitude"]).apply(force / 9.81)
     np.testing.assert_allclose(measured_up, up, rtol=0.0, atol=1e-6)

@@ -16,20 +16,15 @@ from eskf_ros.filter.aiding import (
     zaru,
     zupt,
 )
-from eskf_ros.filter.alignment import (
-    heading_of,
-    note_position,
-    note_velocity,
-    recall_heading,
-    search_heading,
-    start_position,
-)
+from eskf_ros.filter.alignment import start_position
 from eskf_ros.filter.heading_hints import is_heading_told
+from eskf_ros.filter.heading_start import heading_of, recall_heading, search_heading
 from eskf_ros.filter.layout import CONSTRAINTS, Stream, Verdict
 from eskf_ros.filter.local import note_jump
 from eskf_ros.filter.monitors import watch_course, watch_field, watch_heading
 from eskf_ros.filter.optional import join
 from eskf_ros.filter.recovery import gate_of, note, recover, watch_solution
+from eskf_ros.filter.still_window import note_position, note_velocity
 from eskf_ros.filter.stillness import note_evidence, watch_wheels
 from eskf_ros.filter.timeline import open_record
 from eskf_ros.filter.track import follow

@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.alignment import START_VELOCITY_STD, heading_of, restart, set_heading
+from eskf_ros.filter.alignment import START_VELOCITY_STD, restart
 from eskf_ros.filter.heading_search import turn_found
+from eskf_ros.filter.heading_start import heading_of, set_heading
 from eskf_ros.filter.layout import ERROR_SIZE, GYRO_BIAS, NEVER, VELOCITY, Stream
 from eskf_ros.rotation import wrapped
 

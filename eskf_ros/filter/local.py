@@ -11,8 +11,9 @@ from __future__ import annotations
 import math
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.alignment import UNKNOWN_SPEED, heading_of
+from eskf_ros.filter.heading_start import heading_of
 from eskf_ros.filter.layout import GYRO_BIAS, NEVER, VELOCITY
+from eskf_ros.filter.level import UNKNOWN_SPEED
 from eskf_ros.rotation import wrapped
 
 STILL_SPEED = 0.05

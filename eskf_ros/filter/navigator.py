@@ -13,17 +13,10 @@ from eskf_ros.compiled import njit
 from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
 from eskf_ros.filter.aid_monitors import aid_complaints
 from eskf_ros.filter.aiding import heading, mag
-from eskf_ros.filter.alignment import (
-    heading_of,
-    level_again,
-    move_datum,
-    place,
-    restart,
-    set_datum,
-    watch_stillness,
-)
+from eskf_ros.filter.alignment import place, restart
 from eskf_ros.filter.door import ABSENT, admit
 from eskf_ros.filter.fusion import fuse
+from eskf_ros.filter.heading_start import heading_of
 from eskf_ros.filter.layout import (
     AID,
     IMU,
@@ -41,12 +34,15 @@ from eskf_ros.filter.layout import (
     allocate,
     blank_state,
 )
+from eskf_ros.filter.level import level_again
 from eskf_ros.filter.local import carry, measure_step, note_jump
+from eskf_ros.filter.local_frame import move_datum, set_datum
 from eskf_ros.filter.monitors import complaints, is_heading_contradicted
 from eskf_ros.filter.output import status_of, write_odometry
 from eskf_ros.filter.ranges import end_of_epoch, fuse_ranges, is_range, offer_signals
 from eskf_ros.filter.recovery import phase_of
 from eskf_ros.filter.settings import UNKNOWN_ANGLE_VARIANCE, intakes_from, settings_from
+from eskf_ros.filter.still_window import watch_stillness
 from eskf_ros.filter.stillness import add_to_block
 from eskf_ros.filter.strapdown import SECOND, propagate
 from eskf_ros.filter.sway import add_to_part

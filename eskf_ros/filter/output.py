@@ -6,8 +6,9 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.aiding.gnss_velocity import body_rate
-from eskf_ros.filter.alignment import UNKNOWN_SPEED, heading_of
+from eskf_ros.filter.heading_start import heading_of
 from eskf_ros.filter.layout import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, NEVER, POSITION, VELOCITY, Status
+from eskf_ros.filter.level import UNKNOWN_SPEED
 from eskf_ros.rotation import cross, from_matrix, from_rotation_vector, multiply, rotate, rotate_back, to_matrix
 
 WAITING_IMU = int(Status.WAITING_IMU)

@@ -41,15 +41,8 @@ from eskf_ros.filter.aiding.signal import (
     source_of,
     system_of,
 )
-from eskf_ros.filter.alignment import (
-    VELOCITY_SIGMAS,
-    heading_of,
-    note_place,
-    note_speed,
-    recall_heading,
-    search_with,
-    start_position,
-)
+from eskf_ros.filter.alignment import start_position
+from eskf_ros.filter.heading_start import heading_of, recall_heading, search_with
 from eskf_ros.filter.layout import (
     ERROR_SIZE,
     LARGEST_EPOCH,
@@ -62,6 +55,7 @@ from eskf_ros.filter.layout import (
 from eskf_ros.filter.local import note_jump
 from eskf_ros.filter.optional import join, renew
 from eskf_ros.filter.recovery import note_epoch
+from eskf_ros.filter.still_window import VELOCITY_SIGMAS, note_place, note_speed
 from eskf_ros.filter.stillness import weigh_speed
 from eskf_ros.filter.timeline import offer_aid, open_record
 from eskf_ros.filter.update import invert_positive, project, update

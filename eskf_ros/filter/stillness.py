@@ -19,8 +19,8 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.earth import geodetic_to_ecef
-from eskf_ros.filter.alignment import note_speed
 from eskf_ros.filter.layout import CONSTRAINT_INTERVAL, NEVER, SOURCES, VELOCITY, Stream, Verdict
+from eskf_ros.filter.still_window import note_speed
 from eskf_ros.rotation import dot
 
 GNSS_POSITION = int(Stream.GNSS_POSITION)

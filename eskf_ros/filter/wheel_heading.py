@@ -10,7 +10,7 @@ from eskf_ros.compiled import njit
 from eskf_ros.filter.aiding.common import vehicle_axes
 from eskf_ros.filter.aiding.gnss_velocity import body_rate
 from eskf_ros.filter.aiding.wheel import repeated
-from eskf_ros.filter.alignment import search_with
+from eskf_ros.filter.heading_start import search_with
 from eskf_ros.rotation import cross, rotate, to_matrix
 
 LEAST_SPEED = 0.7
