@@ -226,15 +226,15 @@ def _replay(bag: Path, folder: Path, parameters: Parameters, options: argparse.N
     from eskf_ros.replay.topics import InputError
 
     wanted = Options(
-        folder,
-        options.truth,
-        tuple(options.outage),
-        options.mode,
-        options.order,
-        options.output_rate,
-        options.ranges,
-        tuple(options.nav),
-        options.clock_offset,
+        folder=folder,
+        truth=options.truth,
+        outages=tuple(options.outage),
+        mode=options.mode,
+        order=options.order,
+        output_rate=options.output_rate,
+        ranges=options.ranges,
+        navigation=tuple(options.nav),
+        clock_offset=options.clock_offset,
     )
     try:
         with _progress(bag, options.quiet) as progress:
