@@ -45,7 +45,6 @@ setup(
         # The World Magnetic Model, for the declination that a magnetometer needs; MIT, 0.3 MB, without dependencies.
         "mag": ["pygeomag"],
         "test": [
-            "matplotlib",
             "gtsam",
             "hypothesis",
             "mypy",
@@ -57,6 +56,8 @@ setup(
             "ruff",
             "sidereon; sys_platform == 'linux' and platform_machine == 'x86_64'",
         ],
+        # Beside [test]: the benchmarks that draw figures.
+        "benchmark": ["matplotlib"],
     },
     entry_points={
         "console_scripts": [

@@ -22,6 +22,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from markdown_table import table
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -341,12 +342,6 @@ def numbers(error: dict[str, float] | None, keys: Iterable[str]) -> str:
 def cell(values: Iterable[float]) -> str:
     """Numbers in a cell: three decimals below one, two above."""
     return " / ".join(f"{value:.3f}" if value < 1.0 else f"{value:.2f}" for value in values)
-
-
-def table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown."""
-    lines = [headings, ["---"] * len(headings), *rows]
-    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def between_markers(text: str, name: str, content: str) -> str:

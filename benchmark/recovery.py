@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markdown_table import table
 from monte_carlo import NO_SIDE_SLIP, Array, Run, feed, nees, run, state_error
-from real_drives import table
 
 from eskf_ros.filter.layout import POSITION
 from eskf_ros.filter.navigator import Navigator

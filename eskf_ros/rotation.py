@@ -127,18 +127,6 @@ def from_roll_pitch_yaw(roll, pitch, yaw):
 
 
 @njit
-def to_roll_pitch_yaw(q):
-    """Return fixed-axis roll, pitch, yaw (rad) of a unit quaternion; pitch within +-pi/2."""
-    w, x, y, z = q[0], q[1], q[2], q[3]
-    sine = 2.0 * (w * y - x * z)
-    return (
-        math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
-        math.asin(max(-1.0, min(1.0, sine))),
-        math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
-    )
-
-
-@njit
 def left_jacobian(v):
     """Return the left Jacobian of SO(3) at rotation vector ``v`` as three row tuples (Sola, eq. 145).
 

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 import xml.etree.ElementTree
+from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
 
@@ -32,6 +33,8 @@ ROS_PACKAGES = {
     "std_srvs",
     "tf2_msgs",
 }
+# Imported by the tests alone.
+ROS_TEST_PACKAGES = {"rosgraph_msgs", "std_msgs"}
 # Used where somebody else has installed it.
 OPTIONAL = {"robot_localization", "pygeomag"}
 # Import name -> rosdep key that brings it, where it is not python3-NAME.
@@ -39,7 +42,7 @@ ROSDEP_KEYS = {
     "lz4": "mcap-ros2-support",
     "mcap": "mcap-ros2-support",
     "rosbags": "python3-rosbags-pip",
-    "ruamel": "python3-rosbags-pip",
+    "ruamel": "python3-ruamel.yaml",
     "zstandard": "mcap-ros2-support",
 }
 
@@ -64,16 +67,43 @@ SETUP = SetupArguments()
 PACKAGE_XML = xml.etree.ElementTree.parse(CHECKOUT / "package.xml").getroot()
 
 
-def third_party_imports() -> set[str]:
-    """Top-level names of all that the package and its launch files import, but for Python's and the package's own."""
+def imports_of(paths: Iterable[Path]) -> set[str]:
+    """Top-level names of all that these files import."""
     names: set[str] = set()
-    for path in [*(CHECKOUT / "eskf_ros").rglob("*.py"), *(CHECKOUT / "launch").glob("*.py")]:
+    for path in paths:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Import):
                 names |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
                 names.add(node.module.split(".")[0])
+    return names
+
+
+def third_party_imports() -> set[str]:
+    """What the package and its launch files import, but for Python's and the package's own."""
+    names = imports_of([*(CHECKOUT / "eskf_ros").rglob("*.py"), *(CHECKOUT / "launch").glob("*.py")])
     return names - set(sys.stdlib_module_names) - OPTIONAL - {"eskf_ros"}
+
+
+def third_party_imports_of_tests() -> set[str]:
+    """The same for the tests, and for what they borrow from the benchmarks."""
+    benchmarks = {path.stem: path for path in (CHECKOUT / "benchmark").glob("*.py")}
+    tests = {path.stem: path for path in (CHECKOUT / "test").rglob("*.py")}
+    files = set(tests.values())
+    while borrowed := {benchmarks[name] for name in imports_of(files) & (benchmarks.keys() - tests.keys())} - files:
+        files |= borrowed
+    own = {"eskf_ros", "recordings", *benchmarks, *tests}
+    return imports_of(files) - set(sys.stdlib_module_names) - OPTIONAL - own
+
+
+def distributions(lines: Iterable[str]) -> set[str]:
+    """The names in requirements."""
+    return {re.split(r"[<>=\[; ]", line)[0] for line in lines}
+
+
+def dependencies(*tags: str) -> set[str | None]:
+    """The rosdep keys of package.xml under these tags."""
+    return {element.text for tag in tags for element in PACKAGE_XML.findall(tag)}
 
 
 def test_one_version_everywhere() -> None:
@@ -102,14 +132,29 @@ def test_names_and_licence_agree() -> None:
 
 
 def test_every_import_is_declared_for_pip_and_for_rosdep() -> None:
-    required = {re.split(r"[<>=\[; ]", line)[0] for line in SETUP["install_requires"]}  # type: ignore[attr-defined]
-    keys = {element.text for element in PACKAGE_XML.findall("exec_depend")}
+    required = distributions(SETUP["install_requires"])  # type: ignore[arg-type]
+    keys = dependencies("exec_depend")
     imported = third_party_imports()
     assert keys >= ROS_PACKAGES <= imported
     for name in imported - ROS_PACKAGES:
         assert DISTRIBUTIONS.get(name, name) in required, f"{name} is imported, but setup.py does not require it"
         key = ROSDEP_KEYS.get(name, f"python3-{name}")
         assert key in keys, f"{name} is imported, but package.xml has no exec_depend {key}"
+
+
+def test_every_import_of_the_tests_is_declared() -> None:
+    """Nothing that is only there because a benchmark draws, or because another package happens to bring it."""
+    extras: dict[str, list[str]] = SETUP["extras_require"]  # type: ignore[assignment]
+    required = distributions([*SETUP["install_requires"], *extras["test"]])  # type: ignore[misc]
+    imported = third_party_imports_of_tests()
+    assert dependencies("exec_depend", "test_depend") >= ROS_PACKAGES | ROS_TEST_PACKAGES
+    for name in imported - ROS_PACKAGES - ROS_TEST_PACKAGES:
+        assert DISTRIBUTIONS.get(name, name) in required, f"the tests import {name}; setup.py does not require it"
+
+
+def test_what_readme_does_with_launch_files_is_declared() -> None:
+    assert "ros2 launch eskf_ros" in (CHECKOUT / "README.md").read_text(encoding="utf-8")
+    assert "ros2launch" in dependencies("exec_depend")
 
 
 def entry_points() -> list[str]:

@@ -108,11 +108,29 @@ def test_rinex_files_beside_the_recording(folder: Path, ahead: float) -> None:
 
 
 def test_an_outage_withholds_the_ranges(folder: Path) -> None:
+    """Counted in epochs, beside the epochs that were read; the signals in them nobody has looked at."""
+    whole = replay(folder / "ranges.mcap", *TIGHT)
+    assert whole["ranges"]["withheld"] == 0
     result = replay(folder / "ranges.mcap", *TIGHT, "--outage", "40:10")
-    assert result["aids"]["pseudorange"]["withheld"] == pytest.approx(50, abs=2)
+    assert result["ranges"]["withheld"] == pytest.approx(50, abs=2)
+    assert result["ranges"]["epochs"] + result["ranges"]["withheld"] == whole["ranges"]["epochs"]
+    assert [aid["withheld"] for aid in result["aids"].values()] == [None, None]
     assert 0.1 < result["outages"][0]["horizontal"] < 30.0
     ins_only = replay(folder / "ranges.mcap", "--mode", "ins-only", config=with_parameters(folder, "mode: tight"))
-    assert ins_only["aids"]["pseudorange"]["withheld"] > 100
+    assert ins_only["ranges"]["withheld"] > 100
+
+
+@pytest.mark.parametrize("solves", [False, True])
+def test_late_ranges_are_counted_under_their_topic(folder: Path, solves: bool) -> None:
+    """All that is made of them, and nothing of it for the ephemerides, which share their stream."""
+    changes = ["history:", "  window: 0.05", "ranges:", f"  use_point_solution: {str(solves).lower()}"]
+    mode = "loose" if solves else "tight"
+    result = replay(folder / "ranges.mcap", "--mode", mode, config=with_parameters(folder, *changes))
+    names = ("gnss_position", "gnss_velocity") if solves else ("pseudorange", "range_rate")
+    late = [result["aids"][name]["late"] for name in names]
+    assert min(late) > 100
+    (warning,) = (line for line in result["warnings"] if "too late" in line)
+    assert f"measurements too late for history.window = 0.05 s: {sum(late)} of gnss/ranges; " in warning
 
 
 def test_loose_on_our_own_point_solution(folder: Path) -> None:

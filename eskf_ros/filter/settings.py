@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -67,6 +68,20 @@ class Intake:
     lowest: float = -math.inf
 
 
+class OptionalBlock(NamedTuple):
+    """Optional states of one kind (`OPTIONAL_SIZES`).
+
+    ``std``: at first; ``correlation_time`` in s, 0 for a random walk; ``streams``: those that need the states.
+    """
+
+    name: str
+    is_on: bool
+    std: Deviation
+    noise_density: Deviation = 0.0
+    correlation_time: float = 0.0
+    streams: tuple[Stream, ...] = ()
+
+
 def _threefold(value: float) -> Axes:
     return (value, value, value)
 
@@ -78,60 +93,71 @@ def _matrix(rpy_deg: tuple[float, ...]) -> FloatArray:
 
 
 def intakes_from(parameters: Parameters) -> dict[Stream, Intake]:
-    """Return how the messages of every stream that sensors send are taken in."""
-    gnss = parameters.gnss
-    position = Intake(
-        gnss.use_position,
-        gnss.time_offset,
-        gnss.covariance_scale,
-        _threefold(gnss.position_std_floor),
-        _threefold(math.nan),
-        math.inf,
-    )
-    velocity = Intake(
-        gnss.use_velocity,
-        gnss.time_offset,
-        gnss.covariance_scale,
-        _threefold(gnss.velocity_std_floor),
-        _threefold(gnss.unknown_velocity_std),
-        HIGHEST_SPEED,
-    )
-    heading, mag, wheel, body, baro = (
-        parameters.heading,
-        parameters.mag,
-        parameters.wheel,
-        parameters.body_velocity,
-        parameters.baro,
-    )
-
-    def aid(
-        group: Aid, floor: Axes, unknown: Axes, largest: float, lacks: bool, largest_variance: float = math.inf
-    ) -> Intake:
-        return Intake(
-            group.use, group.time_offset, group.covariance_scale, floor, unknown, largest, lacks, largest_variance
-        )
-
-    # A message without a covariance says nothing of the pitch.
-    heading_std = (
-        _threefold(math.radians(heading.std_floor_deg)),
-        (math.radians(heading.unknown_std_deg), math.nan, math.nan),
-    )
-    wheel_std = (
-        (wheel.speed_std_floor, wheel.yaw_rate_std_floor, 1.0),
-        (wheel.unknown_speed_std, wheel.unknown_yaw_rate_std, 1.0),
-    )
+    """Return how the messages of the streams are taken in, but for ranges: `Navigator.push_ranges` does that itself."""
+    gnss, heading, mag = parameters.gnss, parameters.heading, parameters.mag
+    wheel, body, baro = parameters.wheel, parameters.body_velocity, parameters.baro
     return {
-        Stream.GNSS_POSITION: position,
-        Stream.GNSS_VELOCITY: velocity,
-        Stream.HEADING: aid(heading, *heading_std, LARGEST_ANGLE, True, UNKNOWN_ANGLE_VARIANCE),
-        Stream.MAG: aid(mag, _threefold(mag.std_floor), _threefold(mag.unknown_std), STRONGEST_FIELD, False),
-        Stream.WHEEL: aid(wheel, *wheel_std, HIGHEST_SPEED, True),
-        Stream.BODY_VELOCITY: aid(body, _threefold(body.std_floor), _threefold(body.unknown_std), HIGHEST_SPEED, True),
-        Stream.BARO: replace(
-            aid(baro, _threefold(baro.std_floor), _threefold(baro.unknown_std), HIGHEST_PRESSURE, True),
+        Stream.GNSS_POSITION: Intake(
+            is_used=gnss.use_position,
+            time_offset=gnss.time_offset,
+            covariance_scale=gnss.covariance_scale,
+            std_floor=_threefold(gnss.position_std_floor),
+            unknown_std=_threefold(math.nan),
+            largest=math.inf,
+        ),
+        Stream.GNSS_VELOCITY: Intake(
+            is_used=gnss.use_velocity,
+            time_offset=gnss.time_offset,
+            covariance_scale=gnss.covariance_scale,
+            std_floor=_threefold(gnss.velocity_std_floor),
+            unknown_std=_threefold(gnss.unknown_velocity_std),
+            largest=HIGHEST_SPEED,
+        ),
+        Stream.HEADING: _intake(
+            heading,
+            std_floor=_threefold(math.radians(heading.std_floor_deg)),
+            # A message without a covariance says nothing of the pitch.
+            unknown_std=(math.radians(heading.unknown_std_deg), math.nan, math.nan),
+            largest=LARGEST_ANGLE,
+            may_lack_axes=True,
+            largest_variance=UNKNOWN_ANGLE_VARIANCE,
+        ),
+        Stream.MAG: _intake(
+            mag,
+            std_floor=_threefold(mag.std_floor),
+            unknown_std=_threefold(mag.unknown_std),
+            largest=STRONGEST_FIELD,
+        ),
+        Stream.WHEEL: _intake(
+            wheel,
+            std_floor=(wheel.speed_std_floor, wheel.yaw_rate_std_floor, 1.0),
+            unknown_std=(wheel.unknown_speed_std, wheel.unknown_yaw_rate_std, 1.0),
+            largest=HIGHEST_SPEED,
+            may_lack_axes=True,
+        ),
+        Stream.BODY_VELOCITY: _intake(
+            body,
+            std_floor=_threefold(body.std_floor),
+            unknown_std=_threefold(body.unknown_std),
+            largest=HIGHEST_SPEED,
+            may_lack_axes=True,
+        ),
+        Stream.BARO: _intake(
+            baro,
+            std_floor=_threefold(baro.std_floor),
+            unknown_std=_threefold(baro.unknown_std),
+            largest=HIGHEST_PRESSURE,
+            may_lack_axes=True,
             lowest=LOWEST_PRESSURE,
         ),
     }
+
+
+def _intake(group: Aid, **particulars: Any) -> Intake:
+    """Return an Intake with what all aids have as parameters of one name, and their particulars."""
+    return Intake(
+        is_used=group.use, time_offset=group.time_offset, covariance_scale=group.covariance_scale, **particulars
+    )
 
 
 def gate_probabilities(parameters: Parameters) -> dict[Stream, float]:
@@ -218,9 +244,7 @@ def describe_vehicle(settings: np.void, parameters: Parameters) -> None:
     settings["zupt_velocity_std"] = parameters.zupt.velocity_std
     settings["zupt_rate_std"] = parameters.zupt.rate_std
     body = parameters.body_velocity
-    roll, pitch, yaw = (math.radians(angle) for angle in body.mount_rpy_deg)
-    sensor_to_base = np.array(to_matrix(from_roll_pitch_yaw(roll, pitch, yaw)))
-    settings["body_velocity_axes_body"] = sensor_to_base.T @ settings["imu_to_base"]
+    settings["body_velocity_axes_body"] = _matrix(body.mount_rpy_deg).T @ settings["imu_to_base"]
     arms = (("wheel", wheel.position), ("nhc", nhc.position), ("body_velocity", body.mount_position))
     for name, position in arms:
         arm_base = np.subtract(position, parameters.imu.mount_position)
@@ -238,39 +262,85 @@ def place_optional_states(settings: np.void, parameters: Parameters) -> None:
     The offsets of the constellations join one by one, with the first signal of each (`ranges`).
     """
     settings["reach"] = end = ERROR_SIZE
-    baro, mag = parameters.baro, parameters.mag
-    estimate = parameters.estimate
-    mounting_std, mounting_walk = math.radians(estimate.mounting_std_deg), estimate.mounting_random_walk
-    offset_std, offset_walk = math.radians(parameters.heading.offset_std_deg), parameters.heading.offset_random_walk
-    scale_std, scale_walk = estimate.wheel_scale_std, estimate.wheel_scale_random_walk
+    for block in optional_blocks(parameters):
+        settings[f"{block.name}_at"] = end if block.is_on else NOWHERE
+        if not block.is_on:
+            continue
+        size, time = OPTIONAL_SIZES[block.name], block.correlation_time
+        place = slice(end - ERROR_SIZE, end - ERROR_SIZE + size)
+        settings["optional_std"][place] = block.std
+        settings["optional_noise_density"][place] = block.noise_density
+        settings["optional_decay"][place] = 1.0 / time if time > 0.0 else 0.0
+        end += size
+        for stream in block.streams:
+            settings["reach"][stream] = end
+
+
+def optional_blocks(parameters: Parameters) -> tuple[OptionalBlock, ...]:
+    """Return the optional states in the order of their places."""
+    estimate, heading, baro, mag = parameters.estimate, parameters.heading, parameters.baro, parameters.mag
     ranges, is_tight = parameters.ranges, parameters.mode == "tight"
     time = ranges.correlation_time if is_tight else parameters.gnss.correlation_time
-    clock_noise = (ranges.clock_bias_noise, ranges.clock_drift_noise)
-    # Name, whether it is on, first deviation, driving noise, correlation time (0: random walk), streams that need it.
-    blocks: tuple[tuple[str, bool, Deviation, Deviation, float, tuple[Stream, ...]], ...] = (
-        ("position_error", time > 0.0, 1.0, math.sqrt(2.0 / time) if time else 0.0, time, (Stream.GNSS_POSITION,)),
-        ("mounting", estimate.mounting, mounting_std, mounting_walk, 0.0, (Stream.NHC, Stream.WHEEL)),
-        ("wheel_scale", estimate.wheel_scale, scale_std, scale_walk, 0.0, (Stream.WHEEL,)),
-        ("clock", is_tight, START_CLOCK_STD, clock_noise, 0.0, (Stream.PSEUDORANGE, Stream.RANGE_RATE)),
-        ("inter_system", is_tight, inter_system_stds(parameters), ranges.inter_system_noise, 0.0, ()),
-        ("heading_offset", offset_std > 0.0, offset_std, offset_walk, 0.0, (Stream.HEADING,)),
-        # Not by whether it is used, which may change while running: places stay.
-        ("baro_offset", True, baro.offset_std, baro.offset_random_walk, 0.0, (Stream.BARO,)),
-        ("baro_scale", True, baro.scale_std, 0.0, 0.0, (Stream.BARO,)),
-        ("mag_error", True, math.radians(mag.error_std_deg), 0.0, 0.0, (Stream.MAG,)),
-        ("magnetic_bias", estimate.magnetic_bias, estimate.magnetic_bias_std, 0.0, 0.0, (Stream.MAG,)),
+    return (
+        OptionalBlock(
+            "position_error",
+            is_on=time > 0.0,
+            std=1.0,
+            noise_density=math.sqrt(2.0 / time) if time else 0.0,
+            correlation_time=time,
+            streams=(Stream.GNSS_POSITION,),
+        ),
+        OptionalBlock(
+            "mounting",
+            is_on=estimate.mounting,
+            std=math.radians(estimate.mounting_std_deg),
+            noise_density=estimate.mounting_random_walk,
+            streams=(Stream.NHC, Stream.WHEEL),
+        ),
+        OptionalBlock(
+            "wheel_scale",
+            is_on=estimate.wheel_scale,
+            std=estimate.wheel_scale_std,
+            noise_density=estimate.wheel_scale_random_walk,
+            streams=(Stream.WHEEL,),
+        ),
+        OptionalBlock(
+            "clock",
+            is_on=is_tight,
+            std=START_CLOCK_STD,
+            noise_density=(ranges.clock_bias_noise, ranges.clock_drift_noise),
+            streams=(Stream.PSEUDORANGE, Stream.RANGE_RATE),
+        ),
+        OptionalBlock(
+            "inter_system",
+            is_on=is_tight,
+            std=inter_system_stds(parameters),
+            noise_density=ranges.inter_system_noise,
+        ),
+        OptionalBlock(
+            "heading_offset",
+            is_on=heading.offset_std_deg > 0.0,
+            std=math.radians(heading.offset_std_deg),
+            noise_density=heading.offset_random_walk,
+            streams=(Stream.HEADING,),
+        ),
+        # Not by whether the sensor is used, which may change while running: places stay.
+        OptionalBlock(
+            "baro_offset",
+            is_on=True,
+            std=baro.offset_std,
+            noise_density=baro.offset_random_walk,
+            streams=(Stream.BARO,),
+        ),
+        OptionalBlock("baro_scale", is_on=True, std=baro.scale_std, streams=(Stream.BARO,)),
+        OptionalBlock("mag_error", is_on=True, std=math.radians(mag.error_std_deg), streams=(Stream.MAG,)),
+        OptionalBlock(
+            "magnetic_bias",
+            is_on=estimate.magnetic_bias,
+            std=estimate.magnetic_bias_std,
+            streams=(Stream.MAG,),
+        ),
     )
-    for name, is_on, std, noise_density, time, streams in blocks:
-        settings[f"{name}_at"] = end if is_on else NOWHERE
-        if not is_on:
-            continue
-        place = slice(end - ERROR_SIZE, end - ERROR_SIZE + OPTIONAL_SIZES[name])
-        settings["optional_std"][place] = std
-        settings["optional_noise_density"][place] = noise_density
-        settings["optional_decay"][place] = 1.0 / time if time > 0.0 else 0.0
-        end += OPTIONAL_SIZES[name]
-        for stream in streams:
-            settings["reach"][stream] = end
 
 
 def inter_system_stds(parameters: Parameters) -> tuple[float, ...]:

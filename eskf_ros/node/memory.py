@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import os
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,8 @@ from typing import Any
 from eskf_ros.filter.warm_start import Memory
 
 VERSION = 1
+VECTORS = ("accel_bias", "accel_bias_std", "gyro_bias", "gyro_bias_std")
+LARGEST_FLOAT = sys.float_info.max
 
 
 def write_memory(path: Path, memory: Memory) -> None:
@@ -37,22 +39,39 @@ def read_memory(path: Path) -> Memory | None:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return None
-    except (OSError, ValueError) as error:
+    # Brackets by the thousand are a RecursionError.
+    except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} cannot be read: {error}") from error
     try:
         return _checked(content)
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} is not a warm start file of this version: {error!r}") from error
+    except ValueError as error:
+        raise ValueError(f"{path} is not a warm start file of this version: {error}") from error
 
 
-def _checked(content: dict[str, object]) -> Memory:
-    if content.pop("version") != VERSION:
-        raise ValueError("another version")
-    values = {name: tuple(value) if isinstance(value, list) else value for name, value in content.items()}
-    memory = Memory(**values)  # type: ignore[arg-type]
-    biases = (memory.accel_bias, memory.accel_bias_std, memory.gyro_bias, memory.gyro_bias_std)
-    # What is no number at all makes isfinite raise the TypeError.
-    single: list[Any] = [value for value in values.values() if not isinstance(value, tuple)]
-    if any(len(bias) != 3 for bias in biases) or not all(math.isfinite(value) for value in [*single, *sum(biases, ())]):
-        raise ValueError("not three finite numbers for each bias and one for all else")
-    return memory
+def _checked(content: object) -> Memory:
+    if not isinstance(content, dict):
+        raise ValueError("not a JSON object")
+    if content.get("version") != VERSION:
+        raise ValueError(f"version is {content.get('version')!r}, not {VERSION}")
+    wanted = [field.name for field in dataclasses.fields(Memory)]
+    missing, unknown = set(wanted) - content.keys(), content.keys() - {"version", *wanted}
+    if missing or unknown:
+        raise ValueError(f"missing: {sorted(missing)}, unknown: {sorted(unknown)}")
+    return Memory(**{name: _value(name, content[name]) for name in wanted})
+
+
+def _value(name: str, given: object) -> Any:
+    if name in VECTORS:
+        if not isinstance(given, list) or len(given) != 3 or not all(map(_is_finite, given)):
+            raise ValueError(f"{name} is not three finite numbers")
+        return tuple(given)
+    if not _is_finite(given):
+        raise ValueError(f"{name} is not a finite number")
+    if name == "stamp" and not isinstance(given, int):
+        raise ValueError("stamp is not a whole number")
+    return given
+
+
+def _is_finite(value: object) -> bool:
+    """Whether it is a number that a float can hold; an integer of JSON may be larger, and True is an int too."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and -LARGEST_FLOAT <= value <= LARGEST_FLOAT

@@ -33,7 +33,7 @@ class Feed:
     Attributes:
         first_stamp: ns, the earliest IMU stamp of the first batch that has IMU samples.
         imu_count: IMU samples offered.
-        withheld: how many messages were not offered, by stream.
+        withheld: how many messages were not offered, by input.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class Feed:
         self._gnss_over = False
         self.first_stamp: int | None = None
         self.imu_count = 0
-        self.withheld = {kind.stream: 0 for kind in topics.inputs}
+        self.withheld = dict.fromkeys(topics.inputs, 0)
         self._pushes = {kind.name: kind.push_of(navigator, intake) for kind in topics.inputs}
 
     def ordered(self, batches: Iterable[dict[str, Batch]]) -> Iterable[dict[str, Batch]]:
@@ -86,7 +86,7 @@ class Feed:
             push_imu_until(place)
             self._gnss_over = self._gnss_over or (self._ins_only and self._navigator.status >= Status.GOOD)
             if kind.is_gnss and (self._gnss_over or (self._outages and self._in_outage(arguments[0]))):
-                self.withheld[kind.stream] += 1
+                self.withheld[kind] += 1
             else:
                 self._pushes[kind.name](*arguments)
         if imu is not None:

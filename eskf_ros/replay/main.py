@@ -226,15 +226,15 @@ def _replay(bag: Path, folder: Path, parameters: Parameters, options: argparse.N
     from eskf_ros.replay.topics import InputError
 
     wanted = Options(
-        folder,
-        options.truth,
-        tuple(options.outage),
-        options.mode,
-        options.order,
-        options.output_rate,
-        options.ranges,
-        tuple(options.nav),
-        options.clock_offset,
+        folder=folder,
+        truth=options.truth,
+        outages=tuple(options.outage),
+        mode=options.mode,
+        order=options.order,
+        output_rate=options.output_rate,
+        ranges=options.ranges,
+        navigation=tuple(options.nav),
+        clock_offset=options.clock_offset,
     )
     try:
         with _progress(bag, options.quiet) as progress:
@@ -293,9 +293,11 @@ def _show(summary: dict[str, Any], folder: Path, to_stderr: bool) -> None:
     counted = ("offered", "fused", "rejected", "late", "withheld")
     aids = _table("aid", *counted, "NIS", "in 95 %")
     for name, aid in summary["aids"].items():
-        counts = [str(aid[key]) for key in counted]
+        counts = [_rounded(aid[key], "d") for key in counted]
         aids.add_row(name, *counts, _rounded(aid["nis_mean"], ".2f"), _rounded(aid["nis_in_95"], ".1%"))
     console.print(aids)
+    if "ranges" in summary:
+        console.print(f"Epochs of ranges: {summary['ranges']['epochs']}, withheld: {summary['ranges']['withheld']}")
     if "error" in summary:
         errors = _table("error against truth", "rms", "50 %", "95 %", "largest")
         units = {"horizontal": "m", "vertical": "m", "speed": "m/s", "heading_deg": "deg"}

@@ -125,7 +125,7 @@ def replay(
                 "mode": options.mode or parameters.mode,
                 "order": options.order,
                 **summary.result(navigator, clock.total()),
-                **({} if intake is None else ranges_result(navigator, intake)),
+                **({} if intake is None else ranges_result(navigator, intake, feed)),
                 **({} if compared is None else truth_result(topics.truth, truth.offered, compared)),
                 "outages": summary.outages(compared),
                 "warnings": [

@@ -6,16 +6,16 @@ Stamps are integer ns, lengths m, times s; what is not known is null.
   `restarts`: how often the alignment started again; `position_resets`: how often fixes won over the filter.
 - `aids.{name}`: `offered` measurements by their final verdict: `fused` (weighed_down and reset too), `late`
   (outside_history), `rejected` (all other verdicts but waiting, which is for those newer than the last IMU sample); all
-  of them in `verdicts`. `withheld` were
-  not offered (--outage, --mode ins-only). `nis_mean` and `nis_in_95` are over all measurements that were tested, the
-  gated ones included.
+  of them in `verdicts`. `withheld` measurements were not offered (--outage, --mode ins-only), null where they are
+  parts of epochs of ranges: those are counted whole, in `ranges`. `nis_mean` and `nis_in_95` are over all measurements
+  that were tested, the gated ones included.
 - `..._in_95`, `in_95`: share of the values not above the 95 % quantile of chi-square (ideal 0.95, cautious above).
 - `final`: the state at the newest IMU sample, `position` and `velocity` of base_link in map, `lla` deg deg m, `rpy_deg`
   about the local vertical, yaw 0 = east; biases in IMU axes.
 - `error`: absolute errors at the truth epochs from the first known position on, heading from the first known heading
   on; of the antenna when the truth is a NavSatFix. `nees`: e' P^-1 e, 3 degrees of freedom, so its ideal mean is 3.
-- `ranges`: `epochs` read, `signals` by `gnss.ranges.Status`, milliseconds the receiver's clock jumped by, how often
-  most satellites contradicted the state, which then was given the uncertainty they showed.
+- `ranges`: `epochs` read and epochs `withheld`, `signals` by `gnss.ranges.Status`, milliseconds the receiver's clock
+  jumped by, how often most satellites contradicted the state, which then was given the uncertainty they showed.
 - `outages[]`: `distance` is the length of the estimated path; the errors are those at the last truth epoch within.
 - `timing`: `write` is the work of a thread beside the others, of which `wait` was waited for.
 """
@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from eskf_ros.filter.layout import STREAM_NAMES, Status, Stream, Verdict
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.inputs import Input
 from eskf_ros.parameters import Parameters
 from eskf_ros.ranges.intake import RangeIntake
 from eskf_ros.replay.feed import Feed
@@ -39,6 +40,8 @@ from eskf_ros.simulate.map_frame import MapFrame, east_north_up_to_ecef, to_geod
 
 CHI_SQUARE_95 = np.array([math.nan, 3.841458820694124, 5.991464547107979, 7.814727903251179])
 """95 % quantile of chi-square by degrees of freedom: `in_95` is the share of values not above it."""
+MADE_OF_RANGES = (Stream.PSEUDORANGE, Stream.RANGE_RATE, Stream.GNSS_POSITION, Stream.GNSS_VELOCITY)
+"""What an epoch of ranges is offered as: its signals, or in mode loose its point solution."""
 OUTAGE_ERRORS = ("horizontal", "vertical", "heading_deg")
 
 
@@ -97,7 +100,15 @@ class Summary:
 
     def _aids(self) -> list[Stream]:
         """The inputs of the recording, and the constraints that were ever active."""
-        return [stream for stream in Stream if stream in self._feed.withheld or self._verdicts[stream].any()]
+        inputs = {kind.stream for kind in self._feed.withheld}
+        return [stream for stream in Stream if stream in inputs or self._verdicts[stream].any()]
+
+    def _withheld(self, stream: Stream) -> int | None:
+        """None where the messages are epochs of ranges: what would have been offered of them nobody has found out."""
+        inputs = [kind for kind in self._feed.withheld if stream in streams_of(kind)]
+        if any(kind.name == "ranges" for kind in inputs):
+            return None
+        return sum(self._feed.withheld[kind] for kind in inputs)
 
     def _aid(self, stream: Stream) -> dict[str, Any]:
         """`rejected` is every verdict but fused, waiting, and outside_history, which is `late`."""
@@ -110,7 +121,7 @@ class Summary:
             "fused": fused,
             "rejected": offered - fused - late - waiting,
             "late": late,
-            "withheld": self._feed.withheld.get(stream, 0),
+            "withheld": self._withheld(stream),
             "nis_mean": float(self._nis_sum[stream] / tested) if tested else None,
             "nis_in_95": float(self._nis_inside[stream] / tested) if tested else None,
             "verdicts": self._verdict_counts(stream),
@@ -142,12 +153,15 @@ class Summary:
                 f"the alignment started again {navigator.restarts} times: the IMU was silent for seconds, or fix after "
                 "fix contradicted the filter (IMU noise parameters too small, wrong mounting, lever arm or time offset)"
             )
-        late = {name: int(self._verdicts[kind.stream, Verdict.OUTSIDE_HISTORY]) for kind, name in topics.inputs.items()}
+        late = {
+            name: int(self._verdicts[list(streams_of(kind)), Verdict.OUTSIDE_HISTORY].sum())
+            for kind, name in topics.inputs.items()
+        }
         late[topics.imu] = navigator.imu_counts["late"]
         if any(late.values()):
             counts = ", ".join(f"{count} of {name}" for name, count in late.items() if count)
             lines.append(
-                f"messages too late for history.window = {parameters.history.window:g} s: {counts}; "
+                f"measurements too late for history.window = {parameters.history.window:g} s: {counts}; "
                 f"a window of {navigator.window_needed:.3f} s would have taken them"
             )
         if not self._rows:
@@ -178,12 +192,20 @@ def truth_result(topic: str, offered: int, compared: NDArray[Any]) -> dict[str, 
     }
 
 
-def ranges_result(navigator: Navigator, intake: RangeIntake) -> dict[str, Any]:
+def streams_of(kind: Input) -> tuple[Stream, ...]:
+    """Where in the records the measurements of an input are; ephemerides are none."""
+    if not kind.is_timed:
+        return ()
+    return MADE_OF_RANGES if kind.name == "ranges" else (kind.stream,)
+
+
+def ranges_result(navigator: Navigator, intake: RangeIntake, feed: Feed) -> dict[str, Any]:
     """`ranges`: what became of epochs and signals before the filter, and what the filter found out about the clock."""
     state = navigator.state[0]
     return {
         "ranges": {
             "epochs": intake.epochs,
+            "withheld": sum(count for kind, count in feed.withheld.items() if kind.name == "ranges"),
             "point_solutions": intake.solved,
             "signals": {status.name.lower(): count for status, count in sorted(navigator.range_statuses.items())},
             "clock_jumps_ms": int(state["clock_jumps"]),

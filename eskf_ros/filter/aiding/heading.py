@@ -51,18 +51,19 @@ def linearize(state, payload, source, settings, work):
     if level_square < STEEPEST**2:
         return 0
     level = math.sqrt(level_square)
+    predicted_yaw, predicted_pitch = predict(state, source, settings)
     size = 0
     if payload[3] > 0.0:
         place = settings.heading_offset_at
         if source == 0 and place < state.error_size:
             yaw -= state.optional[place - ERROR_SIZE]
             work.jacobian[0, place] = 1.0
-        work.innovation[0] = wrapped(yaw - math.atan2(d[1], d[0]))
+        work.innovation[0] = wrapped(yaw - predicted_yaw)
         set_attitude_row(work.jacobian, 0, state, local_to_ecef, azimuth_change(d, level_square))
         work.noise[0, 0] = payload[3]
         size = 1
     if payload[6] > 0.0:
-        work.innovation[size] = payload[1] - math.atan2(-d[2], level)
+        work.innovation[size] = payload[1] - predicted_pitch
         set_attitude_row(work.jacobian, size, state, local_to_ecef, (-d[1] / level, d[0] / level, 0.0))
         if size == 1:
             work.noise[0, 1] = payload[4]

@@ -64,11 +64,10 @@ def linearize(state, settings, work):
         return 0
     clear(work)
     rotation = to_matrix(state.attitude)
-    rate = body_rate(state, rotation)
     arm = settings.nhc_arm_body
     forward, left, up = vehicle_axes(state, settings)
-    velocity = point_velocity(state, rotation, rate, arm)
-    speed, sideways, upwards = dot(forward, velocity), dot(left, velocity), dot(up, velocity)
+    speed = dot(forward, point_velocity(state, rotation, body_rate(state, rotation), arm))
+    sideways, upwards = predict(state, settings)
     _yaw, pitch = mounting_of(state, settings)
     cosine, sine = math.cos(pitch), math.sin(pitch)
 

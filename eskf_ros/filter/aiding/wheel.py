@@ -85,8 +85,8 @@ def linearize(state, payload, settings, work):
     arm = settings.wheel_arm_body
     forward, left, up = vehicle_axes(state, settings)
     velocity = point_velocity(state, rotation, rate, arm)
-    speed, turn_rate = dot(forward, velocity), dot(up, rate)
-    scale = scale_of(state, settings)
+    speed, scale = dot(forward, velocity), scale_of(state, settings)
+    predicted_speed, turn_rate = predict(state, settings)
     _yaw, pitch = mounting_of(state, settings)
     cosine, sine = math.cos(pitch), math.sin(pitch)
     rate_variance = gyro_noise_variance(state, settings)
@@ -94,7 +94,7 @@ def linearize(state, payload, settings, work):
 
     size = 0
     if payload[3] >= 0.0:
-        work.innovation[0] = payload[0] - scale * speed
+        work.innovation[0] = payload[0] - predicted_speed
         set_point_velocity_row(work.jacobian, 0, forward, scale, state, rotation, arm)
         sideways, upwards = dot(left, velocity), dot(up, velocity)
         set_mounting(work.jacobian, 0, scale * cosine * sideways, -scale * upwards, state, settings)
