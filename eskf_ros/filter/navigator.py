@@ -360,11 +360,13 @@ class Navigator:
         status: int,
         arrival: int = 0,
         frame_id: str = "",
+        from_ranges: bool = False,
     ) -> None:
         """Take a position of the antenna: degrees, ellipsoidal metres, nine numbers East-North-Up (m2, row-major).
 
         ``covariance_type`` and ``status`` as in NavSatFix. An unknown or all-zero covariance takes the table
-        ``gnss.status_std_horizontal`` and ``_vertical``. ``frame_id`` tells which antenna it is.
+        ``gnss.status_std_horizontal`` and ``_vertical``. ``frame_id`` tells which antenna it is. ``from_ranges``: it
+        was solved here from the ranges of the first receiver (``ranges.use_point_solution``).
         """
         gnss = self.parameters.gnss
         stand_in = NO_STAND_IN
@@ -382,7 +384,7 @@ class Navigator:
                 door = BAD_VALUE
             elif self._needs_field:
                 self._add_field(latitude_deg, longitude_deg, altitude, stamp)
-        self._push_gnss(Stream.GNSS_POSITION, stamp, arrival, frame_id, door)
+        self._push_gnss(Stream.GNSS_POSITION, stamp, arrival, frame_id, from_ranges, door)
 
     def push_gnss_velocity(
         self,
@@ -391,14 +393,15 @@ class Navigator:
         covariance: Sequence[float] | FloatArray,
         arrival: int = 0,
         frame_id: str = "",
+        from_ranges: bool = False,
     ) -> None:
         """Take a velocity of the antenna relative to the Earth: East-North-Up m/s, nine numbers m2/s2 (row-major).
 
-        An all-zero or absent covariance (first number negative) becomes ``gnss.unknown_velocity_std``. ``frame_id``
-        tells which antenna it is.
+        An all-zero or absent covariance (first number negative) becomes ``gnss.unknown_velocity_std``. ``frame_id`` and
+        ``from_ranges`` as in `push_gnss_position`.
         """
         door = self._take(Stream.GNSS_VELOCITY, velocity_enu, covariance)
-        self._push_gnss(Stream.GNSS_VELOCITY, stamp, arrival, frame_id, door)
+        self._push_gnss(Stream.GNSS_VELOCITY, stamp, arrival, frame_id, from_ranges, door)
 
     def push(
         self,
@@ -659,12 +662,13 @@ class Navigator:
             declination = found
         self._offered[0]["payload"][mag.FIELD : mag.FIELD + 4] = (1.0, declination, inclination, strength)
 
-    def _push_gnss(self, stream: Stream, stamp: int, arrival: int, frame_id: str, door: int) -> None:
+    def _push_gnss(self, stream: Stream, stamp: int, arrival: int, frame_id: str, from_ranges: bool, door: int) -> None:
         """Sort the record that is on offer into the timeline, as one of the receiver with this frame."""
-        second = self.parameters.second_gnss
-        is_second = second.frame_id != "" and frame_id == second.frame_id
+        second, ranges = self.parameters.second_gnss, self.parameters.ranges
+        is_second = second.frame_id != "" and frame_id == second.frame_id and not from_ranges
         offset = second.time_offset if is_second else self.parameters.gnss.time_offset
-        if self.parameters.mode == "tight" and not is_second:
+        uses_ranges = self.parameters.mode == "tight" or ranges.use_point_solution
+        if uses_ranges and not is_second and not from_ranges:
             # The fix is made of the same ranges: both together would count twice.
             door = DISABLED
         self._push_aid(stream, stamp + round(offset * SECOND), arrival, int(is_second), door)

@@ -58,7 +58,8 @@ def status_report(node: EskfNode, stamp: Time) -> DiagnosticArray:
 
 def waiting_for(node: EskfNode, status: Status, row: np.void, now: int) -> list[str]:
     """What keeps the state from the next rung."""
-    fixes = next(source for source in node.aid_inputs if source.kind.name in ("gnss_fix", "ranges")).monitors
+    wanted_input = "gnss_fix" if node.range_intake is None else "ranges"
+    fixes = next(source for source in node.aid_inputs if source.kind.name == wanted_input).monitors
     if status in (Status.WAITING_IMU, Status.LEVELLING):
         return missing(node, [node.imu_monitor], now) or ["standing still or driving steadily for a moment"]
     if status == Status.FAULT:

@@ -155,10 +155,12 @@ class RangeIntake:
                 COVARIANCE_KNOWN,
                 STATUS_FIX,
                 arrival,
+                from_ranges=True,
             )
         if solution.velocity_status == SolutionStatus.SOLVED:
             covariance = solution.velocity_covariance_enu.ravel()
-            self._navigator.push_gnss_velocity(stamp, solution.velocity_enu.tolist(), covariance, arrival)
+            velocity = solution.velocity_enu.tolist()
+            self._navigator.push_gnss_velocity(stamp, velocity, covariance, arrival, from_ranges=True)
 
     @property
     def complaints(self) -> list[str]:
