@@ -666,12 +666,12 @@ class Navigator:
         """Sort the record that is on offer into the timeline, as one of the receiver with this frame."""
         second, ranges = self.parameters.second_gnss, self.parameters.ranges
         is_second = second.frame_id != "" and frame_id == second.frame_id and not from_ranges
-        offset = second.time_offset if is_second else self.parameters.gnss.time_offset
+        receiver = ranges if from_ranges else second if is_second else self.parameters.gnss
         uses_ranges = self.parameters.mode == "tight" or ranges.use_point_solution
         if uses_ranges and not is_second and not from_ranges:
             # The fix is made of the same ranges: both together would count twice.
             door = DISABLED
-        self._push_aid(stream, stamp + round(offset * SECOND), arrival, int(is_second), door)
+        self._push_aid(stream, stamp + round(receiver.time_offset * SECOND), arrival, int(is_second), door)
 
     def _push_aid(self, stream: Stream, stamp: int, arrival: int, source: int, door: int) -> None:
         """Sort the record that is on offer into the timeline."""

@@ -126,7 +126,7 @@ class RangeIntake:
         if self._solves:
             solution = self._solution(epoch, ephemerides, klobuchar)
             self._navigator.range_statuses.update(Status(status) for status in epoch.ranges["status"].tolist())
-            self._push_solution(stamp + self._time_offset, solution, arrival)
+            self._push_solution(stamp, solution, arrival)
             return solution
         instant = (epoch.week, epoch.seconds)
         signals = measured_epoch(epoch.ranges, *instant, ephemerides, masks=self._masks)
