@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from eskf_ros.filter.layout import Stream
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.gnss.cloud import write_epoch
+from eskf_ros.gnss.ephemeris import Broadcast
+from eskf_ros.gnss.ephemeris_cloud import write_ephemerides
+from eskf_ros.gnss.range_files import read_navigation_files
 from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, SATELLITE_KNOWN, allocate_ranges
 from eskf_ros.parameters import from_mapping
 from eskf_ros.ranges.intake import RangeIntake
@@ -18,6 +24,7 @@ SECOND = 1_000_000_000
 STAMP = 1_700_000_000_123_456_789
 ANTENNA = np.array([6.378e6, 0.0, 0.0])
 WEEK, TOW = 2300, 1000.0
+SKY = Path(__file__).resolve().parents[1] / "bags" / "sky.nav"
 
 
 def intake_of(**given: Any) -> RangeIntake:
@@ -50,3 +57,39 @@ def test_a_point_solution_gets_the_time_offset_of_the_ranges_and_no_other() -> N
     records = records_of(intake)
     assert sorted(records["stream"]) == [Stream.GNSS_POSITION, Stream.GNSS_VELOCITY]
     assert records["stamp"].tolist() == [STAMP + SECOND // 4] * 2
+
+
+def spoiled(broadcasts: list[Broadcast], **fields: float) -> list[Broadcast]:
+    return [broadcast._replace(fields={**broadcast.fields, **fields}) for broadcast in broadcasts]
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [({"sqrt_a": math.nan}, "missing or not finite"), ({"e": 0.9}, "none that a satellite can have")],
+)
+def test_ephemerides_that_place_no_satellite_are_named_and_counted(fields: dict[str, float], words: str) -> None:
+    intake = intake_of(mode="tight")
+    good = read_navigation_files([SKY]).broadcasts[:9]
+    intake.take_ephemerides(STAMP, write_ephemerides(good))
+    assert not intake.refused
+    intake.take_ephemerides(STAMP, write_ephemerides([*spoiled(good[:2], **fields), *good[2:]]))
+    ((reason, count),) = intake.refused.items()
+    assert words in reason
+    assert count == 2
+    assert any("2 times: ephemerides" in text and words in text for text in intake.complaints)
+
+
+def test_what_is_left_out_of_navigation_files_is_told(tmp_path: Path) -> None:
+    assert intake_of(mode="tight", ranges__rinex_nav_files=str(SKY)).notes == []
+    lines = SKY.read_text(encoding="ascii").splitlines(keepends=True)
+    first = next(k for k, line in enumerate(lines) if "END OF HEADER" in line) + 1
+    lines[first + 1] = lines[first + 1].replace("E", "?")
+    lines[first + 10] = lines[first + 10][:61] + " 0.000000000000E+00" + lines[first + 10][80:]
+    path = tmp_path / "spoiled.nav"
+    path.write_text("".join(lines), encoding="ascii")
+    intake = intake_of(mode="tight", ranges__rinex_nav_files=str(path))
+    unreadable, impossible = intake.notes
+    assert unreadable.startswith(str(path))
+    assert unreadable.endswith("(1)")
+    assert impossible == "ranges.rinex_nav_files: a parameter of orbit or clock is none that a satellite can have (1)"
+    assert set(intake.notes) <= set(intake.complaints)

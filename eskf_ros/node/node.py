@@ -244,9 +244,12 @@ class EskfNode(Node):
             return None
         self._solutions = self._publisher(NavSatFix, "gnss/point_solution")
         try:
-            return RangeIntake(self.navigator, self.parameters)
+            intake = RangeIntake(self.navigator, self.parameters)
         except RinexError as error:
             raise ParameterError("ranges.rinex_nav_files", [str(error)]) from error
+        for note in intake.notes:
+            self.get_logger().warn(note)
+        return intake
 
     def _push_orientation(self, stamp: int, message: Imu) -> None:
         q = message.orientation

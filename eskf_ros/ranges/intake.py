@@ -15,7 +15,7 @@ from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.strapdown import SECOND
 from eskf_ros.gnss.cloud import CloudError, Epoch, read_epoch, write_epoch
 from eskf_ros.gnss.dated_ephemerides import DatedEphemerides
-from eskf_ros.gnss.ephemeris import Ephemerides
+from eskf_ros.gnss.ephemeris import Ephemerides, Fault, check
 from eskf_ros.gnss.ephemeris_cloud import read_ephemerides
 from eskf_ros.gnss.measurements import Masks, measured_epoch
 from eskf_ros.gnss.point_solution import PointSettings, PointSolution, SolutionStatus, solve
@@ -61,6 +61,11 @@ BLAMED_SHARE = 0.5
 
 NORMAL = (Status.USABLE, Status.OTHER_SIGNAL)
 
+FAULTS = {
+    Fault.NON_FINITE: "a parameter of orbit or clock is missing or not finite",
+    Fault.BAD_VALUE: "a parameter of orbit or clock is none that a satellite can have",
+}
+
 
 class RangeIntake:
     """Turns clouds into epochs of signals and gives them to a navigator.
@@ -68,7 +73,8 @@ class RangeIntake:
     Attributes:
         epochs: epochs that were read.
         solved: epochs of which a point solution was made.
-        refused: messages that could not be read, by reason.
+        refused: messages and parts of them that could not be used, by reason.
+        notes: what was left out of the files of ``ranges.rinex_nav_files``.
         wants_solution: make a point solution of every epoch, in mode tight too.
     """
 
@@ -80,6 +86,13 @@ class RangeIntake:
         klobuchar = files.klobuchar.get(Gnss.GPS, DEFAULT_KLOBUCHAR)
         self._ephemerides = DatedEphemerides(files.records, klobuchar, round(parameters.history.window * SECOND))
         self._knows_ionosphere = klobuchar is not DEFAULT_KLOBUCHAR
+        self.notes = [
+            f"{complaints.path}: {reason} ({count})"
+            for complaints in files.complaints
+            for reason, count in complaints.counts.items()
+        ]
+        faults = faults_of(files.records)
+        self.notes += [f"ranges.rinex_nav_files: {fault} ({count})" for fault, count in faults.items()]
         self.epochs = 0
         self.solved = 0
         self.refused: Counter[str] = Counter()
@@ -102,7 +115,7 @@ class RangeIntake:
         except CloudError as error:
             self.refused[f"ephemerides: {error}"] += 1
             return
-        for reason, count in read.refused.items():
+        for reason, count in (read.refused + faults_of(read.records)).items():
             self.refused[f"ephemerides: {reason}"] += count
         if len(read.broadcasts):
             klobuchar = read.klobuchar.get(Gnss.GPS)
@@ -165,7 +178,7 @@ class RangeIntake:
     @property
     def complaints(self) -> list[str]:
         """What is wrong with the messages, one sentence each with what to do; empty when nothing is."""
-        found = [f"{count} times: {reason}" for reason, count in self.refused.items()]
+        found = [*self.notes, *(f"{count} times: {reason}" for reason, count in self.refused.items())]
         if self.epochs and not self._knows_ionosphere:
             found.append(
                 "no parameters of the ionosphere came with the ephemerides: those of a middling day stand in for them"
@@ -180,6 +193,11 @@ class RangeIntake:
                     + (f": {remedy}" * bool(remedy))
                 )
         return found
+
+
+def faults_of(records: NDArray[np.void]) -> Counter[str]:
+    """Count the ephemerides (EPHEMERIS) that no satellite will be placed by, by what is wrong with them."""
+    return Counter(FAULTS[Fault(fault)] for fault in check(records).tolist() if fault != Fault.NONE)
 
 
 def compile_ranges(parameters: Parameters) -> None:
