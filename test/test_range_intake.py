@@ -18,7 +18,7 @@ from eskf_ros.gnss.ephemeris_cloud import write_ephemerides
 from eskf_ros.gnss.range_files import read_navigation_files
 from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, SATELLITE_KNOWN, allocate_ranges
 from eskf_ros.parameters import from_mapping
-from eskf_ros.ranges.intake import RangeIntake
+from eskf_ros.ranges.intake import RECENT, RangeIntake
 
 SECOND = 1_000_000_000
 STAMP = 1_700_000_000_123_456_789
@@ -93,3 +93,48 @@ def test_what_is_left_out_of_navigation_files_is_told(tmp_path: Path) -> None:
     assert unreadable.endswith("(1)")
     assert impossible == "ranges.rinex_nav_files: a parameter of orbit or clock is none that a satellite can have (1)"
     assert set(intake.notes) <= set(intake.complaints)
+
+
+def test_what_is_wrong_now_is_told_by_the_last_messages_and_at_the_end_by_all() -> None:
+    """Ephemerides that come late are no complaint for long, and a feed that dies after long is one soon."""
+    intake = intake_of(mode="tight", ranges__rinex_nav_files=str(SKY))
+    good, without = epoch(), epoch(known=False)
+
+    def take(points: NDArray[Any], count: int) -> tuple[bool, bool]:
+        for _ in range(count):
+            intake.take_ranges(STAMP, points)
+        lists = intake.recent_complaints, intake.complaints
+        now, all_along = (any("ranges.rinex_nav_files" in text for text in found) for found in lists)
+        return now, all_along
+
+    assert take(without, 10 * RECENT) == (True, True)
+    assert f"{8 * RECENT} of the last {8 * RECENT} signals cannot be used (stale)" in intake.recent_complaints[0]
+    assert take(good, RECENT // 2 + 1) == (False, True)
+    assert take(good, 20 * RECENT) == (False, False)
+    assert take(without, RECENT // 2 - 1) == (False, False)
+    assert take(without, 2) == (True, False)
+
+
+def test_a_message_that_was_refused_is_a_complaint_for_a_while_and_counted_for_ever() -> None:
+    intake = intake_of(mode="tight", ranges__rinex_nav_files=str(SKY))
+    bad = epoch()[["gnss_id", "sv_id"]]
+    intake.take_ranges(STAMP, bad)
+    intake.take_ephemerides(STAMP, bad)
+    assert len(intake.recent_complaints) == len(intake.complaints) == 2
+    for _ in range(RECENT - 1):
+        intake.take_ranges(STAMP, epoch())
+    (text,) = intake.recent_complaints
+    assert text.startswith("ephemerides: ")
+    assert text.endswith(f"(1 in the last {RECENT} messages of ranges and ephemerides)")
+    intake.take_ranges(STAMP, epoch())
+    assert intake.recent_complaints == []
+    assert len(intake.complaints) == sum(intake.refused.values()) == 2
+
+
+@pytest.mark.parametrize("solves", [False, True])
+def test_recent_signals_are_judged_with_a_point_solution_too(solves: bool) -> None:
+    given = {"ranges__use_point_solution": True} if solves else {"mode": "tight"}
+    intake = intake_of(**given)
+    intake.take_ranges(STAMP, epoch(known=False))
+    assert any("8 of the last 8 signals cannot be used (no_ephemeris)" in text for text in intake.recent_complaints)
+    assert sum(intake._navigator.range_statuses.values()) == 8

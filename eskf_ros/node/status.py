@@ -35,7 +35,7 @@ def status_report(node: EskfNode, stamp: Time) -> DiagnosticArray:
     if is_silent and status != Status.FAULT:
         # Whatever the estimate was worth: nothing is published without the IMU.
         status = Status.WAITING_IMU
-    ranges = [] if node.range_intake is None else node.range_intake.complaints
+    ranges = [] if node.range_intake is None else node.range_intake.recent_complaints
     problems = [*node.navigator.complaints, *ranges, *clock_complaints(node.monitors, now)]
     problems += [*mismatches(node), *second_publishers(node), *node.trouble.problems()]
     waiting = waiting_for(node, status, row, now)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ from eskf_ros.gnss.ranges import (
     allocate_ranges,
     locate,
     one_per_satellite,
+    status_counts,
 )
 from eskf_ros.gnss.signals import Gnss
 from eskf_ros.parameters import Parameters
@@ -59,12 +61,18 @@ REMEDIES = {
 BLAMED_SHARE = 0.5
 """Of all signals: so many that cannot be used for one reason are worth a sentence."""
 
+RECENT = 60
+"""Messages that what is wrong at the moment is judged by: a minute of a slow receiver."""
+
 NORMAL = (Status.USABLE, Status.OTHER_SIGNAL)
 
 FAULTS = {
     Fault.NON_FINITE: "a parameter of orbit or clock is missing or not finite",
     Fault.BAD_VALUE: "a parameter of orbit or clock is none that a satellite can have",
 }
+
+
+Key = TypeVar("Key")
 
 
 class RangeIntake:
@@ -96,6 +104,8 @@ class RangeIntake:
         self.epochs = 0
         self.solved = 0
         self.refused: Counter[str] = Counter()
+        self._recently_refused: deque[Counter[str]] = deque(maxlen=RECENT)
+        self._recent_statuses: deque[Counter[Status]] = deque(maxlen=RECENT)
         self.wants_solution = False
 
     def configure(self, parameters: Parameters) -> None:
@@ -113,10 +123,10 @@ class RangeIntake:
         try:
             read = read_ephemerides(points)
         except CloudError as error:
-            self.refused[f"ephemerides: {error}"] += 1
+            self._note_message({f"ephemerides: {error}": 1})
             return
-        for reason, count in (read.refused + faults_of(read.records)).items():
-            self.refused[f"ephemerides: {reason}"] += count
+        refused = read.refused + faults_of(read.records)
+        self._note_message({f"ephemerides: {reason}": count for reason, count in refused.items()})
         if len(read.broadcasts):
             klobuchar = read.klobuchar.get(Gnss.GPS)
             self._ephemerides.add(stamp + self._time_offset, read.records, klobuchar)
@@ -127,22 +137,25 @@ class RangeIntake:
         try:
             epoch = read_epoch(points)
         except CloudError as error:
-            self.refused[f"ranges: {error}"] += 1
+            self._note_message({f"ranges: {error}": 1})
             return None
         if math.isnan(epoch.seconds):
-            self.refused["ranges: no time tag in the epoch"] += 1
+            self._note_message({"ranges: no time tag in the epoch": 1})
             return None
-        if epoch.left_out:
-            self.refused["ranges: signals beyond the first 200 of an epoch"] += epoch.left_out
+        left_out = {"ranges: signals beyond the first 200 of an epoch": epoch.left_out}
+        self._note_message(left_out if epoch.left_out else {})
         self.epochs += 1
         ephemerides, klobuchar = self._ephemerides.at(stamp + self._time_offset)
         if self._solves:
             solution = self._solution(epoch, ephemerides, klobuchar)
-            self._navigator.range_statuses.update(Status(status) for status in epoch.ranges["status"].tolist())
+            statuses = status_counts(epoch.ranges)
+            self._recent_statuses.append(statuses)
+            self._navigator.range_statuses.update(statuses)
             self._push_solution(stamp, solution, arrival)
             return solution
         instant = (epoch.week, epoch.seconds)
         signals = measured_epoch(epoch.ranges, *instant, ephemerides, masks=self._masks)
+        self._recent_statuses.append(status_counts(signals))
         self._navigator.push_ranges(stamp, instant, signals, klobuchar, arrival)
         return self._solution(epoch, ephemerides, klobuchar) if self.wants_solution else None
 
@@ -175,24 +188,50 @@ class RangeIntake:
             velocity = solution.velocity_enu.tolist()
             self._navigator.push_gnss_velocity(stamp, velocity, covariance, arrival, from_ranges=True)
 
+    def _note_message(self, refused: Mapping[str, int]) -> None:
+        """Take note of a message of either topic: what of it could not be used, by reason."""
+        self.refused.update(refused)
+        self._recently_refused.append(Counter(refused))
+
     @property
     def complaints(self) -> list[str]:
-        """What is wrong with the messages, one sentence each with what to do; empty when nothing is."""
-        found = [*self.notes, *(f"{count} times: {reason}" for reason, count in self.refused.items())]
-        if self.epochs and not self._knows_ionosphere:
-            found.append(
-                "no parameters of the ionosphere came with the ephemerides: those of a middling day stand in for them"
-            )
-        statuses = self._navigator.range_statuses
-        total = sum(statuses.values()) - statuses[Status.OTHER_SIGNAL]
-        for status, count in statuses.items():
-            if status not in NORMAL and count > BLAMED_SHARE * total:
-                remedy = REMEDIES.get(status, "")
-                found.append(
-                    f"{count} of {total} signals cannot be used ({status.name.lower()})"
-                    + (f": {remedy}" * bool(remedy))
-                )
-        return found
+        """What was wrong with the messages from the first to the last, one sentence each with what to do."""
+        refused = [f"{count} times: {reason}" for reason, count in self.refused.items()]
+        return [*self.notes, *refused, *self._ionosphere_complaints(), *blamed(self._navigator.range_statuses)]
+
+    @property
+    def recent_complaints(self) -> list[str]:
+        """What is wrong with the messages at the moment: judged by the last `RECENT` of them, whatever came before."""
+        messages = len(self._recently_refused)
+        refused = [
+            f"{reason} ({count} in the last {messages} messages of ranges and ephemerides)"
+            for reason, count in added(self._recently_refused).items()
+        ]
+        return [*refused, *self._ionosphere_complaints(), *blamed(added(self._recent_statuses), "the last ")]
+
+    def _ionosphere_complaints(self) -> list[str]:
+        if not self.epochs or self._knows_ionosphere:
+            return []
+        return ["no parameters of the ionosphere came with the ephemerides: those of a middling day stand in for them"]
+
+
+def blamed(statuses: Mapping[Status, int], which: str = "") -> list[str]:
+    """Say why most signals cannot be used, if so, and what to do; ``which``: signals these are."""
+    total = sum(statuses.values()) - statuses.get(Status.OTHER_SIGNAL, 0)
+    found = []
+    for status, count in statuses.items():
+        if status not in NORMAL and count > BLAMED_SHARE * total:
+            remedy = f": {REMEDIES[status]}" if status in REMEDIES else ""
+            found.append(f"{count} of {which}{total} signals cannot be used ({status.name.lower()}){remedy}")
+    return found
+
+
+def added(counts: Iterable[Counter[Key]]) -> Counter[Key]:
+    """Add up counts."""
+    total: Counter[Key] = Counter()
+    for one in counts:
+        total.update(one)
+    return total
 
 
 def faults_of(records: NDArray[np.void]) -> Counter[str]:
