@@ -26,7 +26,9 @@ from eskf_ros.filter.door import ABSENT, admit
 from eskf_ros.filter.fusion import fuse
 from eskf_ros.filter.layout import (
     AID,
+    ERROR_SIZE,
     IMU,
+    INTER_SYSTEM,
     LOCAL,
     NEVER,
     ODOMETRY,
@@ -550,6 +552,43 @@ class Navigator:
             return None
         latitude, longitude, altitude = (float(value) for value in state["datum"])
         return math.degrees(latitude), math.degrees(longitude), altitude
+
+    @property
+    def clock(self) -> tuple[float, float] | None:
+        """Bias (m) and drift (m/s) of the receiver's clock; None while ranges have not told both."""
+        state, place = self._states[0], int(self._settings["clock_at"][0])
+        if place >= state["error_size"] or not state["clock_known"].all():
+            return None
+        bias, drift = state["optional"][place - ERROR_SIZE : place - ERROR_SIZE + 2].tolist()
+        return bias, drift
+
+    @property
+    def inter_system_offsets(self) -> dict[int, float]:
+        """By what the ranges of a constellation (`gnss.signals.time_group`) are longer than those of GPS (m).
+
+        Those of which no signal came are not there.
+        """
+        state, first = self._states[0], int(self._settings["inter_system_at"][0])
+        offsets = state["optional"][first - ERROR_SIZE : max(first, int(state["error_size"])) - ERROR_SIZE].tolist()
+        return {group: offset for group, offset in zip(INTER_SYSTEM, offsets) if offset}
+
+    @property
+    def latest_epoch(self) -> np.ndarray:
+        """Records of the pseudoranges of the newest epoch that was judged, as they stand; none after a long silence."""
+        judged = self._aids[: int(self._states["aid_next"][0])]
+        codes = judged[judged["stream"] == Stream.PSEUDORANGE]
+        newest = codes[codes["stamp"] == codes["stamp"].max(initial=NEVER)]
+        return np.array([tuple(row[name] for name in RECORD.names or ()) for row in newest], RECORD)
+
+    @property
+    def clock_jumps(self) -> int:
+        """Milliseconds by which the receiver's clock has jumped, to either side."""
+        return int(self._states["clock_jumps"][0])
+
+    @property
+    def range_faults(self) -> int:
+        """How often most satellites contradicted the estimate, which was then given the uncertainty they show."""
+        return int(self._states["range_faults"][0])
 
     @property
     def imu_counts(self) -> dict[str, int]:
