@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from eskf_ros.filter.layout import Stream
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.gnss.cloud import write_epoch
-from eskf_ros.gnss.ephemeris import Broadcast
+from eskf_ros.gnss.ephemeris import Broadcast, Message
 from eskf_ros.gnss.ephemeris_cloud import write_ephemerides
 from eskf_ros.gnss.range_files import read_navigation_files
 from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, SATELLITE_KNOWN, allocate_ranges
+from eskf_ros.gnss.signals import Gnss
 from eskf_ros.parameters import from_mapping
-from eskf_ros.ranges.intake import RECENT, RangeIntake
+from eskf_ros.ranges.intake import DEFAULT_KLOBUCHAR, RECENT, RangeIntake
 
 SECOND = 1_000_000_000
 STAMP = 1_700_000_000_123_456_789
@@ -138,3 +139,44 @@ def test_recent_signals_are_judged_with_a_point_solution_too(solves: bool) -> No
     intake.take_ranges(STAMP, epoch(known=False))
     assert any("8 of the last 8 signals cannot be used (no_ephemeris)" in text for text in intake.recent_complaints)
     assert sum(intake._navigator.range_statuses.values()) == 8
+
+
+def test_the_ionosphere_is_that_of_gps_and_where_there_is_none_of_qzss(monkeypatch: pytest.MonkeyPatch) -> None:
+    """BeiDou's parameters belong to another model and are not used."""
+    intake = intake_of(mode="tight")
+    used: list[NDArray[np.float64]] = []
+    monkeypatch.setattr(intake._navigator, "push_ranges", lambda *arguments: used.append(arguments[3]))
+    ephemeris = read_navigation_files([SKY]).broadcasts[0]
+    messages = {Gnss.BEIDOU: Message.D1, Gnss.QZSS: Message.LNAV, Gnss.GPS: Message.LNAV}
+
+    def after(gnss: Gnss, seconds: int, number: float) -> float:
+        """The first parameter an epoch is used with, long after a message of this constellation."""
+        broadcast = ephemeris._replace(gnss=gnss, sv_id=2, message=messages[gnss])
+        points = write_ephemerides([broadcast], {gnss: np.full(8, number)})
+        intake.take_ephemerides(STAMP + seconds * SECOND, points)
+        intake.take_ranges(STAMP + 100 * SECOND, epoch())
+        return float(used[-1][0])
+
+    def stands_in() -> bool:
+        return any("those of a middling day stand in" in text for text in intake.recent_complaints)
+
+    assert after(Gnss.BEIDOU, 10, 3.0) == DEFAULT_KLOBUCHAR[0]
+    assert stands_in()
+    assert after(Gnss.QZSS, 11, 5.0) == 5.0
+    assert not stands_in()
+    assert after(Gnss.GPS, 12, 1.0) == 1.0
+    assert after(Gnss.QZSS, 13, 6.0) == 1.0
+    assert after(Gnss.GPS, 14, 2.0) == 2.0
+    assert not intake.refused
+
+
+@pytest.mark.parametrize("letter", ["QZS", "BDS"])
+def test_the_ionosphere_of_qzss_out_of_a_file(tmp_path: Path, letter: str) -> None:
+    path = tmp_path / "other.nav"
+    text = SKY.read_text(encoding="ascii")
+    path.write_text(text.replace("GPSA", f"{letter}A").replace("GPSB", f"{letter}B"), encoding="ascii")
+    intake = intake_of(mode="tight", ranges__rinex_nav_files=str(path))
+    intake.take_ranges(STAMP, epoch())
+    assert bool(intake.recent_complaints) == (letter == "BDS")
+    first = DEFAULT_KLOBUCHAR[0] if letter == "BDS" else 1.8626e-8
+    assert intake._serving(STAMP)[1][0] == first

@@ -16,11 +16,12 @@ from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.strapdown import SECOND
 from eskf_ros.gnss.cloud import CloudError, Epoch, read_epoch, write_epoch
 from eskf_ros.gnss.dated_ephemerides import DatedEphemerides
-from eskf_ros.gnss.ephemeris import Ephemerides, Fault, check
+from eskf_ros.gnss.ephemeris import EPHEMERIS, Ephemerides, Fault, check
 from eskf_ros.gnss.ephemeris_cloud import read_ephemerides
 from eskf_ros.gnss.measurements import Masks, measured_epoch
 from eskf_ros.gnss.point_solution import PointSettings, PointSolution, SolutionStatus, solve
 from eskf_ros.gnss.range_files import read_navigation_files
+from eskf_ros.gnss.range_model import NO_KLOBUCHAR
 from eskf_ros.gnss.ranges import (
     CODE_VALID,
     DOPPLER_VALID,
@@ -43,6 +44,13 @@ DEFAULT_KLOBUCHAR = np.array(
 """Broadcast on 1 January 2004, a year of middling solar activity: stands in where no parameters came (as in RTKLIB).
 
 Zeros would leave the whole delay, metres that differ from satellite to satellite.
+"""
+
+KLOBUCHAR_SOURCES = {Gnss.GPS, Gnss.QZSS}
+"""Whose parameters are those of one and the same model: GPS's are used, QZSS's where those are missing.
+
+BeiDou's go with another one: geographic latitudes, a layer at 375 km, a period that has an upper limit
+(BDS-SIS-ICD-B1I 3.0, section 5.2.4).
 """
 
 COVARIANCE_KNOWN = 3
@@ -91,9 +99,11 @@ class RangeIntake:
         self._navigator = navigator
         self.configure(parameters)
         files = read_navigation_files([Path(name) for name in parameters.ranges.rinex_nav_files.split(":") if name])
-        klobuchar = files.klobuchar.get(Gnss.GPS, DEFAULT_KLOBUCHAR)
-        self._ephemerides = DatedEphemerides(files.records, klobuchar, round(parameters.history.window * SECOND))
-        self._knows_ionosphere = klobuchar is not DEFAULT_KLOBUCHAR
+        window = round(parameters.history.window * SECOND)
+        self._ephemerides = DatedEphemerides(files.records, files.klobuchar.get(Gnss.GPS, NO_KLOBUCHAR), window)
+        stand_in = files.klobuchar.get(Gnss.QZSS, DEFAULT_KLOBUCHAR)
+        self._ionosphere_stand_in = DatedEphemerides(np.zeros(0, EPHEMERIS), stand_in, window)
+        self._knows_ionosphere = bool(KLOBUCHAR_SOURCES & files.klobuchar.keys())
         self.notes = [
             f"{complaints.path}: {reason} ({count})"
             for complaints in files.complaints
@@ -128,9 +138,11 @@ class RangeIntake:
         refused = read.refused + faults_of(read.records)
         self._note_message({f"ephemerides: {reason}": count for reason, count in refused.items()})
         if len(read.broadcasts):
-            klobuchar = read.klobuchar.get(Gnss.GPS)
-            self._ephemerides.add(stamp + self._time_offset, read.records, klobuchar)
-            self._knows_ionosphere = self._knows_ionosphere or klobuchar is not None
+            stamp += self._time_offset
+            self._ephemerides.add(stamp, read.records, read.klobuchar.get(Gnss.GPS))
+            if Gnss.QZSS in read.klobuchar:
+                self._ionosphere_stand_in.add(stamp, np.zeros(0, EPHEMERIS), read.klobuchar[Gnss.QZSS])
+            self._knows_ionosphere = self._knows_ionosphere or bool(KLOBUCHAR_SOURCES & read.klobuchar.keys())
 
     def take_ranges(self, stamp: int, points: NDArray[Any], arrival: int = 0) -> PointSolution | None:
         """Give the points of a message of `gnss/ranges` to the navigator; return the point solution if one was made."""
@@ -145,7 +157,7 @@ class RangeIntake:
         left_out = {"ranges: signals beyond the first 200 of an epoch": epoch.left_out}
         self._note_message(left_out if epoch.left_out else {})
         self.epochs += 1
-        ephemerides, klobuchar = self._ephemerides.at(stamp + self._time_offset)
+        ephemerides, klobuchar = self._serving(stamp + self._time_offset)
         if self._solves:
             solution = self._solution(epoch, ephemerides, klobuchar)
             statuses = status_counts(epoch.ranges)
@@ -158,6 +170,12 @@ class RangeIntake:
         self._recent_statuses.append(status_counts(signals))
         self._navigator.push_ranges(stamp, instant, signals, klobuchar, arrival)
         return self._solution(epoch, ephemerides, klobuchar) if self.wants_solution else None
+
+    def _serving(self, stamp: int) -> tuple[Ephemerides, NDArray[np.float64]]:
+        """Return the ephemerides and the parameters of the ionosphere for an epoch with this stamp (ns)."""
+        ephemerides, klobuchar = self._ephemerides.at(stamp)
+        _, stand_in = self._ionosphere_stand_in.at(stamp)
+        return ephemerides, stand_in if np.isnan(klobuchar).any() else klobuchar
 
     def _solution(self, epoch: Epoch, ephemerides: Ephemerides, klobuchar: NDArray[np.float64]) -> PointSolution:
         """Solve the epoch alone, as a receiver would; from nothing, so that the order of epochs leaves no trace."""
