@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from eskf_ros.filter.layout import Stream
+from eskf_ros.filter.layout import Stream, Verdict
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.gnss.cloud import write_epoch
 from eskf_ros.gnss.ephemeris import Broadcast, Message
 from eskf_ros.gnss.ephemeris_cloud import write_ephemerides
 from eskf_ros.gnss.range_files import read_navigation_files
 from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, SATELLITE_KNOWN, allocate_ranges
+from eskf_ros.gnss.ranges import Status as RangeStatus
 from eskf_ros.gnss.signals import Gnss
 from eskf_ros.parameters import from_mapping
 from eskf_ros.ranges.intake import DEFAULT_KLOBUCHAR, RECENT, RangeIntake
@@ -180,3 +181,31 @@ def test_the_ionosphere_of_qzss_out_of_a_file(tmp_path: Path, letter: str) -> No
     assert bool(intake.recent_complaints) == (letter == "BDS")
     first = DEFAULT_KLOBUCHAR[0] if letter == "BDS" else 1.8626e-8
     assert intake._serving(STAMP)[1][0] == first
+
+
+def test_two_hundred_signals_of_an_epoch_go_through_the_filter_and_are_counted() -> None:
+    """Of 250 the first 200 are read: each has its record, and the robot stays where it is."""
+    intake = intake_of(mode="tight")
+    navigator = intake._navigator
+    points = np.concatenate([epoch(50)] * 5)
+    points["gnss_id"] = np.repeat([Gnss.GPS, Gnss.GALILEO, Gnss.BEIDOU, Gnss.QZSS, Gnss.GPS], 50)
+    epochs = 20
+    stamps = STAMP + np.arange(0, (epochs + 3) * SECOND, SECOND // 50)
+    for k in range(epochs + 3):
+        part = stamps[50 * k : 50 * (k + 1)]
+        navigator.push_imu(part, np.tile([0.0, 0.0, 9.8], (50, 1)), np.zeros((50, 3)))
+        if k >= 3:
+            intake.take_ranges(int(part[-1]), points)
+    records = records_of(intake)
+    assert navigator.range_statuses == {RangeStatus.USABLE: 200 * epochs}
+    assert sum(intake.refused.values()) == 50 * epochs
+    assert any("signals beyond the first 200 of an epoch" in text for text in intake.complaints)
+    for stream in (Stream.PSEUDORANGE, Stream.RANGE_RATE):
+        verdicts = records["verdict"][records["stream"] == stream]
+        assert len(verdicts) == 200 * epochs
+        assert len(set(records["source"][records["stream"] == stream])) == 200
+        assert np.isin(verdicts, (Verdict.FUSED, Verdict.WEIGHED_DOWN)).sum() > 100 * epochs
+    assert len(navigator.latest_epoch) == 200
+    row = navigator.odometry[0]
+    assert np.isfinite(row["pose_covariance"]).all()
+    assert np.linalg.norm(row["velocity_map"]) < 0.1
