@@ -217,13 +217,18 @@ RANGES = ("ranges", "ephemerides")
 
 
 def inputs_of(parameters: Parameters) -> tuple[Input, ...]:
-    """The rows in use: either what a receiver solved or its ranges, never both."""
-    unused = FIXES if uses_ranges(parameters) else RANGES
+    """The rows in use: what a receiver solved or its ranges; beside ranges the fixes of a second receiver, if any.
+
+    What the first receiver solved comes on the same topics as that of the second: the navigator refuses it.
+    """
+    unused: tuple[str, ...] = RANGES
+    if uses_ranges(parameters):
+        unused = () if parameters.second_gnss.frame_id else FIXES
     return tuple(kind for kind in INPUTS if kind.name not in unused)
 
 
 def uses_ranges(parameters: Parameters) -> bool:
-    """Whether GNSS is used by its ranges."""
+    """Whether the first receiver is used by its ranges."""
     return parameters.mode == "tight" or parameters.ranges.use_point_solution
 
 

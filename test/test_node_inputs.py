@@ -15,7 +15,7 @@ from eskf_ros.filter.settings import intakes_from
 from eskf_ros.gnss.cloud import fields_of, write_epoch
 from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, SATELLITE_KNOWN, allocate_ranges
 from eskf_ros.gnss.ranges import Status as RangeStatus
-from eskf_ros.inputs import INPUTS, RANGES
+from eskf_ros.inputs import FIXES, INPUTS, RANGES
 from eskf_ros.parameters import Leaf, ParameterError, Parameters, from_mapping, leaves
 from eskf_ros.ranges.intake import RangeIntake
 
@@ -171,6 +171,19 @@ def test_each_receiver_has_its_own_offset_and_its_own_clock() -> None:
     # Without a second receiver every frame is that of the first, the empty one too.
     one = {source.kind.name: source for source in open_inputs(Parameters(), str)}["gnss_fix"]
     assert (one.receiver(""), one.receiver("rear"), len(one.monitors)) == (0, 0, 1)
+
+
+@needs_ros
+@pytest.mark.parametrize("change", [{"mode": "tight"}, {"ranges.use_point_solution": True}])
+def test_beside_ranges_the_node_listens_to_the_fixes_of_a_second_receiver_only(change: dict[str, Any]) -> None:
+    from eskf_ros.node.inputs import open_inputs
+
+    def heard(given: dict[str, Any]) -> set[str]:
+        return {source.kind.name for source in open_inputs(from_mapping(given), str)} & {*RANGES, *FIXES}
+
+    assert heard({}) == heard({"second_gnss.frame_id": "rear"}) == set(FIXES)
+    assert heard(change) == set(RANGES)
+    assert heard({**change, "second_gnss.frame_id": "rear"}) == {*RANGES, *FIXES}
 
 
 @needs_ros

@@ -23,6 +23,7 @@ CONFIG = CHECKOUT / "config" / "tunnel_drive.yaml"
 SKY = CHECKOUT / "bags" / "sky.nav"
 PART = {"start": 12.0, "stop": 72.0}
 TIGHT = ("--mode", "tight")
+FIX_FRAME = "gps"
 
 
 @pytest.fixture(scope="module")
@@ -144,6 +145,30 @@ def test_loose_on_our_own_point_solution(folder: Path) -> None:
     assert result["error"]["horizontal"]["p50"] < 3.0
     files = ["--ranges", str(folder / "rover.obs"), "--nav", str(SKY)]
     assert replay(folder / "plain.mcap", *files, config=config)["mode"] == "loose"
+
+
+@pytest.mark.parametrize("solves", [False, True])
+def test_beside_ranges_the_fixes_of_a_second_receiver_are_used_and_those_of_the_first_refused(
+    folder: Path, solves: bool
+) -> None:
+    """The fixes of the recording have one frame: whose they are says the parameter."""
+    point_solution = ("ranges:", f"  use_point_solution: {str(solves).lower()}")
+    options = () if solves else TIGHT
+
+    def result(frame: str) -> dict[str, Any]:
+        second = ("second_gnss:", f"  frame_id: '{frame}'", "  lever_arm: [0.8, -0.2, 1.4]")
+        return replay(folder / "ranges.mcap", *options, config=with_parameters(folder, *point_solution, *second))
+
+    alone, firsts, seconds = result(""), result("rear"), result(FIX_FRAME)
+    assert firsts["final"] == alone["final"]
+    own = alone["aids"].get("gnss_position", {"offered": 0, "fused": 0})
+    for name in ("gnss_position", "gnss_velocity"):
+        refused, used = firsts["aids"][name], seconds["aids"][name]
+        assert refused["fused"] == own["fused"]
+        assert refused["verdicts"]["disabled"] == refused["offered"] - own["offered"] > 200
+        assert "disabled" not in used["verdicts"]
+        assert used["fused"] > own["fused"] + 200
+    assert firsts["aids"].get("pseudorange") == alone["aids"].get("pseudorange")
 
 
 def test_missing_ephemerides_are_named_with_the_remedy(folder: Path) -> None:

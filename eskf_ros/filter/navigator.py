@@ -19,7 +19,9 @@ from eskf_ros.filter.fusion import fuse
 from eskf_ros.filter.heading_start import heading_of
 from eskf_ros.filter.layout import (
     AID,
+    ERROR_SIZE,
     IMU,
+    INTER_SYSTEM,
     LOCAL,
     NEVER,
     ODOMETRY,
@@ -356,11 +358,13 @@ class Navigator:
         status: int,
         arrival: int = 0,
         frame_id: str = "",
+        from_ranges: bool = False,
     ) -> None:
         """Take a position of the antenna: degrees, ellipsoidal metres, nine numbers East-North-Up (m2, row-major).
 
         ``covariance_type`` and ``status`` as in NavSatFix. An unknown or all-zero covariance takes the table
-        ``gnss.status_std_horizontal`` and ``_vertical``. ``frame_id`` tells which antenna it is.
+        ``gnss.status_std_horizontal`` and ``_vertical``. ``frame_id`` tells which antenna it is. ``from_ranges``: it
+        was solved here from the ranges of the first receiver (``ranges.use_point_solution``).
         """
         gnss = self.parameters.gnss
         stand_in = NO_STAND_IN
@@ -379,7 +383,7 @@ class Navigator:
             elif self.needs_field:
                 field = self._field_at(latitude_deg, longitude_deg, altitude, stamp)
                 self._offered[0]["payload"][mag.FIELD : mag.FIELD + 4] = field
-        self._push_gnss(Stream.GNSS_POSITION, stamp, arrival, frame_id, door)
+        self._push_gnss(Stream.GNSS_POSITION, stamp, arrival, frame_id, from_ranges, door)
 
     def push_gnss_velocity(
         self,
@@ -388,14 +392,15 @@ class Navigator:
         covariance: Sequence[float] | FloatArray,
         arrival: int = 0,
         frame_id: str = "",
+        from_ranges: bool = False,
     ) -> None:
         """Take a velocity of the antenna relative to the Earth: East-North-Up m/s, nine numbers m2/s2 (row-major).
 
-        An all-zero or absent covariance (first number negative) becomes ``gnss.unknown_velocity_std``. ``frame_id``
-        tells which antenna it is.
+        An all-zero or absent covariance (first number negative) becomes ``gnss.unknown_velocity_std``. ``frame_id`` and
+        ``from_ranges`` as in `push_gnss_position`.
         """
         door = self._take(Stream.GNSS_VELOCITY, velocity_enu, covariance)
-        self._push_gnss(Stream.GNSS_VELOCITY, stamp, arrival, frame_id, door)
+        self._push_gnss(Stream.GNSS_VELOCITY, stamp, arrival, frame_id, from_ranges, door)
 
     def push(
         self,
@@ -550,6 +555,43 @@ class Navigator:
         return math.degrees(latitude), math.degrees(longitude), altitude
 
     @property
+    def clock(self) -> tuple[float, float] | None:
+        """Bias (m) and drift (m/s) of the receiver's clock; None while ranges have not told both."""
+        state, place = self._states[0], int(self._settings["clock_at"][0])
+        if place >= state["error_size"] or not state["clock_known"].all():
+            return None
+        bias, drift = state["optional"][place - ERROR_SIZE : place - ERROR_SIZE + 2].tolist()
+        return bias, drift
+
+    @property
+    def inter_system_offsets(self) -> dict[int, float]:
+        """By what the ranges of a constellation (`gnss.signals.time_group`) are longer than those of GPS (m).
+
+        Those of which no signal came are not there.
+        """
+        state, first = self._states[0], int(self._settings["inter_system_at"][0])
+        offsets = state["optional"][first - ERROR_SIZE : max(first, int(state["error_size"])) - ERROR_SIZE].tolist()
+        return {group: offset for group, offset in zip(INTER_SYSTEM, offsets) if offset}
+
+    @property
+    def latest_epoch(self) -> np.ndarray:
+        """Records of the pseudoranges of the newest epoch that was judged, as they stand; none after a long silence."""
+        judged = self._aids[: int(self._states["aid_next"][0])]
+        codes = judged[judged["stream"] == Stream.PSEUDORANGE]
+        newest = codes[codes["stamp"] == codes["stamp"].max(initial=NEVER)]
+        return np.array([tuple(row[name] for name in RECORD.names or ()) for row in newest], RECORD)
+
+    @property
+    def clock_jumps(self) -> int:
+        """Milliseconds by which the receiver's clock has jumped, to either side."""
+        return int(self._states["clock_jumps"][0])
+
+    @property
+    def range_faults(self) -> int:
+        """How often most satellites contradicted the estimate, which was then given the uncertainty they show."""
+        return int(self._states["range_faults"][0])
+
+    @property
     def imu_counts(self) -> dict[str, int]:
         """IMU samples offered, and refused or replaced by reason."""
         names = ("offered", "duplicate", "late", "bad_value", "bad_stamp")
@@ -666,15 +708,16 @@ class Navigator:
             declination = found
         return 1.0, declination, inclination, strength
 
-    def _push_gnss(self, stream: Stream, stamp: int, arrival: int, frame_id: str, door: int) -> None:
+    def _push_gnss(self, stream: Stream, stamp: int, arrival: int, frame_id: str, from_ranges: bool, door: int) -> None:
         """Sort the record that is on offer into the timeline, as one of the receiver with this frame."""
-        second = self.parameters.second_gnss
-        is_second = second.frame_id != "" and frame_id == second.frame_id
-        offset = second.time_offset if is_second else self.parameters.gnss.time_offset
-        if self.parameters.mode == "tight" and not is_second:
+        second, ranges = self.parameters.second_gnss, self.parameters.ranges
+        is_second = second.frame_id != "" and frame_id == second.frame_id and not from_ranges
+        receiver = ranges if from_ranges else second if is_second else self.parameters.gnss
+        uses_ranges = self.parameters.mode == "tight" or ranges.use_point_solution
+        if uses_ranges and not is_second and not from_ranges:
             # The fix is made of the same ranges: both together would count twice.
             door = DISABLED
-        self._push_aid(stream, stamp + round(offset * SECOND), arrival, int(is_second), door)
+        self._push_aid(stream, stamp + round(receiver.time_offset * SECOND), arrival, int(is_second), door)
 
     def _push_aid(self, stream: Stream, stamp: int, arrival: int, source: int, door: int) -> None:
         """Sort the record that is on offer into the timeline."""

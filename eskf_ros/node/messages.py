@@ -11,7 +11,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from sensor_msgs.msg import NavSatFix, NavSatStatus
 
-from eskf_ros.filter.layout import STREAM_NAMES, Verdict
+from eskf_ros.filter.aiding.signal import name_of
+from eskf_ros.filter.layout import STREAM_NAMES, Stream, Verdict
 from eskf_ros.gnss.point_solution import PointSolution, SolutionStatus
 from eskf_ros.simulate.map_frame import MapFrame
 
@@ -19,6 +20,9 @@ SECOND = 1_000_000_000
 
 GOOD_VERDICTS = (Verdict.FUSED, Verdict.WEIGHED_DOWN, Verdict.DUPLICATE, Verdict.DISABLED)
 """Nothing is wrong with what got one of these."""
+
+SIGNALS = (Stream.PSEUDORANGE, Stream.RANGE_RATE)
+"""Streams whose sources are signals of satellites."""
 
 
 def set_header(header: Any, stamp: int, frame: str) -> None:
@@ -72,20 +76,21 @@ def solution_message(solution: PointSolution, stamp: int, frame: str) -> NavSatF
 
 
 def record_statuses(records: np.ndarray, stamp: Time) -> DiagnosticArray:
-    """One status per measurement: what became of it, and which receiver it is from (0 the first)."""
+    """One status per measurement: what became of it, and which receiver (0 the first) or which signal it is from."""
     message = DiagnosticArray()
     message.header.stamp = stamp
     for record in records:
         verdict = Verdict(int(record["verdict"]))
         good = verdict in GOOD_VERDICTS
+        stream, source = int(record["stream"]), int(record["source"])
         message.status.append(
             DiagnosticStatus(
                 level=DiagnosticStatus.OK if good else DiagnosticStatus.WARN,
-                name=STREAM_NAMES[int(record["stream"])],
+                name=STREAM_NAMES[stream],
                 message=verdict.name.lower(),
                 values=key_values(
                     {
-                        "receiver": int(record["source"]),
+                        **({"signal": name_of(source)} if stream in SIGNALS else {"receiver": source}),
                         "stamp": f"{int(record['stamp']) // SECOND}.{int(record['stamp']) % SECOND:09d}",
                         "nis": float(record["nis"]),
                         "dof": int(record["dof"]),

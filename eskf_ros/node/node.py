@@ -65,7 +65,9 @@ class EskfNode(Node):
         self.trouble = Trouble(self.get_logger().error)
         self.verdicts: dict[tuple[int, Verdict], int] = {}
         self.resets = 0
-        self.latest_fixes: dict[Verdict, int] = {}
+        is_tight = self.parameters.mode == "tight"
+        self.position_stream = Stream.PSEUDORANGE if is_tight else Stream.GNSS_POSITION
+        self.latest_positions: dict[Verdict, int] = {}
         self._has_noted = False
         self.callbacks, self.callback_time, self.longest_callback = 0, 0.0, 0.0
         self._restarts = 0
@@ -85,7 +87,13 @@ class EskfNode(Node):
         self._bias = self._publisher(TwistWithCovarianceStamped, "imu/bias")
         self._aids = self._publisher(DiagnosticArray, "eskf/aids")
         self._diagnostics = self._publisher(DiagnosticArray, "/diagnostics")
-        self.output_publishers = (*self.outputs.publishers, self._filtered, self._bias, self._aids, self._diagnostics)
+        self.output_publishers: tuple[Any, ...] = (
+            *self.outputs.publishers,
+            self._filtered,
+            self._bias,
+            self._aids,
+            self._diagnostics,
+        )
 
         self._imu_reader = ImuReader()
         topics = self.parameters.topics
@@ -243,10 +251,14 @@ class EskfNode(Node):
         if not uses_ranges(self.parameters):
             return None
         self._solutions = self._publisher(NavSatFix, "gnss/point_solution")
+        self.output_publishers = (*self.output_publishers, self._solutions)
         try:
-            return RangeIntake(self.navigator, self.parameters)
+            intake = RangeIntake(self.navigator, self.parameters)
         except RinexError as error:
             raise ParameterError("ranges.rinex_nav_files", [str(error)]) from error
+        for note in intake.notes:
+            self.get_logger().warn(note)
+        return intake
 
     def _push_orientation(self, stamp: int, message: Imu) -> None:
         q = message.orientation
@@ -287,12 +299,7 @@ class EskfNode(Node):
         """Once a second: final verdicts, biases, filtered fix, diagnostics, other publishers of our transforms."""
         self._is_simulated = bool(self.get_parameter("use_sim_time").value)
         records = self.navigator.take_records()
-        fixes: dict[Verdict, int] = {}
-        for stream, verdict in zip(records["stream"].tolist(), map(Verdict, records["verdict"].tolist())):
-            self.verdicts[stream, verdict] = self.verdicts.get((stream, verdict), 0) + 1
-            if stream == Stream.GNSS_POSITION:
-                fixes[verdict] = fixes.get(verdict, 0) + 1
-        self.latest_fixes = fixes or self.latest_fixes
+        self._count(records)
         stamp = self.get_clock().now().to_msg()
         refused = records[records["verdict"] == Verdict.OUTSIDE_HISTORY]
         for stream in np.unique(refused["stream"]).tolist():
@@ -319,6 +326,15 @@ class EskfNode(Node):
         self.callbacks, self.callback_time, self.longest_callback = 0, 0.0, 0.0
         self._watch_transforms()
         self._reports += 1
+
+    def _count(self, records: np.ndarray) -> None:
+        """Count final verdicts by stream, those of the last fixes or pseudoranges apart."""
+        positions: dict[Verdict, int] = {}
+        for stream, verdict in zip(records["stream"].tolist(), map(Verdict, records["verdict"].tolist())):
+            self.verdicts[stream, verdict] = self.verdicts.get((stream, verdict), 0) + 1
+            if stream == self.position_stream:
+                positions[verdict] = positions.get(verdict, 0) + 1
+        self.latest_positions = positions or self.latest_positions
 
     def _on_reset(self) -> tuple[bool, str]:
         self._reset("reset was asked for")

@@ -12,8 +12,10 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from eskf_ros.filter.layout import STREAM_NAMES, Status, Stream
-from eskf_ros.node.clocks import StampMonitor, clock_complaints
+from eskf_ros.filter.aiding.signal import name_of
+from eskf_ros.filter.layout import STREAM_NAMES, Status, Stream, Verdict
+from eskf_ros.gnss.signals import BEIDOU_3, Gnss
+from eskf_ros.node.clocks import SECOND, StampMonitor, clock_complaints
 from eskf_ros.node.messages import key_values
 
 if TYPE_CHECKING:
@@ -25,6 +27,12 @@ TRANSIENT_LOCAL, VOLATILE = DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.V
 SILENCE = 3.0
 """Seconds without a message after which a topic is called silent."""
 
+FEWEST_TO_SOLVE = 4
+"""Satellites that fix a position by themselves."""
+
+GROUP_NAMES = {**{int(gnss): gnss.name.lower() for gnss in Gnss}, BEIDOU_3: "beidou-3", int(Gnss.BEIDOU): "beidou-2"}
+"""What `gnss.signals.time_group` tells apart."""
+
 
 def status_report(node: EskfNode, stamp: Time) -> DiagnosticArray:
     """One status: OK when the state is GOOD and nothing is wrong, ERROR when nothing is published any more."""
@@ -35,8 +43,8 @@ def status_report(node: EskfNode, stamp: Time) -> DiagnosticArray:
     if is_silent and status != Status.FAULT:
         # Whatever the estimate was worth: nothing is published without the IMU.
         status = Status.WAITING_IMU
-    ranges = [] if node.range_intake is None else node.range_intake.complaints
-    problems = [*node.navigator.complaints, *ranges, *clock_complaints(node.monitors, now)]
+    of_ranges = [] if node.range_intake is None else node.range_intake.recent_complaints
+    problems = [*node.navigator.complaints, *of_ranges, *clock_complaints(node.monitors, now)]
     problems += [*mismatches(node), *second_publishers(node), *node.trouble.problems()]
     waiting = waiting_for(node, status, row, now)
     level = DiagnosticStatus.OK if status == Status.GOOD and not problems else DiagnosticStatus.WARN
@@ -50,7 +58,7 @@ def status_report(node: EskfNode, stamp: Time) -> DiagnosticArray:
             name=f"{node.get_fully_qualified_name()}: navigation",
             hardware_id="eskf_ros",
             message="; ".join([status.name, *waiting, *problems]),
-            values=key_values({**figures(node, row), **counters(node), **topics(node, now)}),
+            values=key_values({**figures(node, row), **ranges(node), **counters(node), **topics(node, now)}),
         )
     )
     return report
@@ -58,15 +66,20 @@ def status_report(node: EskfNode, stamp: Time) -> DiagnosticArray:
 
 def waiting_for(node: EskfNode, status: Status, row: np.void, now: int) -> list[str]:
     """What keeps the state from the next rung."""
-    fixes = next(source for source in node.aid_inputs if source.kind.name in ("gnss_fix", "ranges")).monitors
+    wanted_input = "gnss_fix" if node.range_intake is None else "ranges"
+    fixes = next(source for source in node.aid_inputs if source.kind.name == wanted_input).monitors
+    is_tight = node.position_stream == Stream.PSEUDORANGE
     if status in (Status.WAITING_IMU, Status.LEVELLING):
         return missing(node, [node.imu_monitor], now) or ["standing still or driving steadily for a moment"]
     if status == Status.FAULT:
         return ["a reset: call the service ~/reset"]
     if status == Status.DEGRADED:
-        return ["fixes that agree with the estimate: see eskf/aids"]
+        return [f"{'ranges' if is_tight else 'fixes'} that agree with the estimate: see eskf/aids"]
     if status in (Status.WAITING_FIX, Status.COASTING):
-        return missing(node, fixes, now) or [f"fixes come, but none was accepted lately{latest_verdicts(node)}"]
+        unaccepted = (
+            "ranges come, but too few were accepted lately" if is_tight else "fixes come, but none was accepted lately"
+        )
+        return missing(node, fixes, now) or held_by_few(node, row) or [f"{unaccepted}{latest_verdicts(node)}"]
     if status == Status.WAITING_HEADING:
         way = "speeding up, braking or turning tells the heading, a constant velocity does not"
         return missing(node, fixes, now) or [way]
@@ -77,9 +90,23 @@ def waiting_for(node: EskfNode, status: Status, row: np.void, now: int) -> list[
     return []
 
 
+def held_by_few(node: EskfNode, row: np.void) -> list[str]:
+    """Say so when satellites that are too few for a position of their own are fused nevertheless."""
+    epoch = node.navigator.latest_epoch
+    fused = epoch[np.isin(epoch["verdict"], (Verdict.FUSED, Verdict.WEIGHED_DOWN))]
+    count = len({name_of(source).split()[0] for source in fused["source"].tolist()})
+    if not 0 < count < FEWEST_TO_SOLVE or row["stamp"] - fused["stamp"][0] > SILENCE * SECOND:
+        return []
+    return [
+        "1 satellite is fused: it and the IMU hold the position"
+        if count == 1
+        else f"{count} satellites are fused: they and the IMU hold the position"
+    ]
+
+
 def latest_verdicts(node: EskfNode) -> str:
-    """What became of the fixes of the last report that has some."""
-    counts = node.latest_fixes
+    """What became of the fixes, or of the pseudoranges, of the last report that has some."""
+    counts = node.latest_positions
     told = ", ".join(f"{count} {verdict.name.lower()}" for verdict, count in sorted(counts.items()))
     return f" (the last: {told}): see eskf/aids" if told else ": see eskf/aids"
 
@@ -175,8 +202,7 @@ def figures(node: EskfNode, row: np.void) -> dict[str, object]:
         "odometries published": node.outputs.published,
         "restarts": node.navigator.restarts,
         "position resets": node.navigator.position_resets,
-        "fixes": node.navigator.phase(Stream.GNSS_POSITION).name,
-        "velocities": node.navigator.phase(Stream.GNSS_VELOCITY).name,
+        **phases(node),
         "resets": node.resets,
         "datum": node.navigator.datum,
         "window needed (s)": node.navigator.window_needed,
@@ -185,6 +211,33 @@ def figures(node: EskfNode, row: np.void) -> dict[str, object]:
         "longest callback (ms)": f"{1e3 * node.longest_callback:.2f}",
         **{f"place of the {sensor}": node.extrinsics.source_of(sensor) for sensor in node.extrinsics.sensors},
     }
+
+
+def phases(node: EskfNode) -> dict[str, object]:
+    """What the measurements of the first receiver are to the filter."""
+    if node.position_stream == Stream.PSEUDORANGE:
+        return {"position by pseudoranges": node.navigator.phase(Stream.PSEUDORANGE).name}
+    return {
+        "fixes": node.navigator.phase(Stream.GNSS_POSITION).name,
+        "velocities": node.navigator.phase(Stream.GNSS_VELOCITY).name,
+    }
+
+
+def ranges(node: EskfNode) -> dict[str, object]:
+    """What is known of the receiver's clock, and what became of the signals before the filter."""
+    navigator, intake = node.navigator, node.range_intake
+    if intake is None:
+        return {}
+    found: dict[str, object] = {"epochs of ranges": intake.epochs, "point solutions": intake.solved}
+    found.update({f"signals {status.name.lower()}": n for status, n in sorted(navigator.range_statuses.items())})
+    if node.position_stream != Stream.PSEUDORANGE:
+        return found
+    if navigator.clock is not None:
+        bias, drift = navigator.clock
+        found.update({"clock bias (m)": f"{bias:.2f}", "clock drift (m/s)": f"{drift:.3f}"})
+    for group, offset in navigator.inter_system_offsets.items():
+        found[f"clock offset of {GROUP_NAMES[group]} (m)"] = f"{offset:.2f}"
+    return {**found, "clock jumps (ms)": navigator.clock_jumps, "range faults": navigator.range_faults}
 
 
 def counters(node: EskfNode) -> dict[str, object]:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +16,12 @@ from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.strapdown import SECOND
 from eskf_ros.gnss.cloud import CloudError, Epoch, read_epoch, write_epoch
 from eskf_ros.gnss.dated_ephemerides import DatedEphemerides
-from eskf_ros.gnss.ephemeris import Ephemerides
+from eskf_ros.gnss.ephemeris import EPHEMERIS, Ephemerides, Fault, check
 from eskf_ros.gnss.ephemeris_cloud import read_ephemerides
 from eskf_ros.gnss.measurements import Masks, measured_epoch
 from eskf_ros.gnss.point_solution import PointSettings, PointSolution, SolutionStatus, solve
 from eskf_ros.gnss.range_files import read_navigation_files
+from eskf_ros.gnss.range_model import NO_KLOBUCHAR
 from eskf_ros.gnss.ranges import (
     CODE_VALID,
     DOPPLER_VALID,
@@ -28,6 +30,7 @@ from eskf_ros.gnss.ranges import (
     allocate_ranges,
     locate,
     one_per_satellite,
+    status_counts,
 )
 from eskf_ros.gnss.signals import Gnss
 from eskf_ros.parameters import Parameters
@@ -41,6 +44,13 @@ DEFAULT_KLOBUCHAR = np.array(
 """Broadcast on 1 January 2004, a year of middling solar activity: stands in where no parameters came (as in RTKLIB).
 
 Zeros would leave the whole delay, metres that differ from satellite to satellite.
+"""
+
+KLOBUCHAR_SOURCES = {Gnss.GPS, Gnss.QZSS}
+"""Whose parameters are those of one and the same model: GPS's are used, QZSS's where those are missing.
+
+BeiDou's go with another one: geographic latitudes, a layer at 375 km, a period that has an upper limit
+(BDS-SIS-ICD-B1I 3.0, section 5.2.4).
 """
 
 COVARIANCE_KNOWN = 3
@@ -59,7 +69,18 @@ REMEDIES = {
 BLAMED_SHARE = 0.5
 """Of all signals: so many that cannot be used for one reason are worth a sentence."""
 
+RECENT = 60
+"""Messages that what is wrong at the moment is judged by: a minute of a slow receiver."""
+
 NORMAL = (Status.USABLE, Status.OTHER_SIGNAL)
+
+FAULTS = {
+    Fault.NON_FINITE: "a parameter of orbit or clock is missing or not finite",
+    Fault.BAD_VALUE: "a parameter of orbit or clock is none that a satellite can have",
+}
+
+
+Key = TypeVar("Key")
 
 
 class RangeIntake:
@@ -68,7 +89,8 @@ class RangeIntake:
     Attributes:
         epochs: epochs that were read.
         solved: epochs of which a point solution was made.
-        refused: messages that could not be read, by reason.
+        refused: messages and parts of them that could not be used, by reason.
+        notes: what was left out of the files of ``ranges.rinex_nav_files``.
         wants_solution: make a point solution of every epoch, in mode tight too.
     """
 
@@ -77,12 +99,23 @@ class RangeIntake:
         self._navigator = navigator
         self.configure(parameters)
         files = read_navigation_files([Path(name) for name in parameters.ranges.rinex_nav_files.split(":") if name])
-        klobuchar = files.klobuchar.get(Gnss.GPS, DEFAULT_KLOBUCHAR)
-        self._ephemerides = DatedEphemerides(files.records, klobuchar, round(parameters.history.window * SECOND))
-        self._knows_ionosphere = klobuchar is not DEFAULT_KLOBUCHAR
+        window = round(parameters.history.window * SECOND)
+        self._ephemerides = DatedEphemerides(files.records, files.klobuchar.get(Gnss.GPS, NO_KLOBUCHAR), window)
+        stand_in = files.klobuchar.get(Gnss.QZSS, DEFAULT_KLOBUCHAR)
+        self._ionosphere_stand_in = DatedEphemerides(np.zeros(0, EPHEMERIS), stand_in, window)
+        self._knows_ionosphere = bool(KLOBUCHAR_SOURCES & files.klobuchar.keys())
+        self.notes = [
+            f"{complaints.path}: {reason} ({count})"
+            for complaints in files.complaints
+            for reason, count in complaints.counts.items()
+        ]
+        faults = faults_of(files.records)
+        self.notes += [f"ranges.rinex_nav_files: {fault} ({count})" for fault, count in faults.items()]
         self.epochs = 0
         self.solved = 0
         self.refused: Counter[str] = Counter()
+        self._recently_refused: deque[Counter[str]] = deque(maxlen=RECENT)
+        self._recent_statuses: deque[Counter[Status]] = deque(maxlen=RECENT)
         self.wants_solution = False
 
     def configure(self, parameters: Parameters) -> None:
@@ -100,38 +133,49 @@ class RangeIntake:
         try:
             read = read_ephemerides(points)
         except CloudError as error:
-            self.refused[f"ephemerides: {error}"] += 1
+            self._note_message({f"ephemerides: {error}": 1})
             return
-        for reason, count in read.refused.items():
-            self.refused[f"ephemerides: {reason}"] += count
+        refused = read.refused + faults_of(read.records)
+        self._note_message({f"ephemerides: {reason}": count for reason, count in refused.items()})
         if len(read.broadcasts):
-            klobuchar = read.klobuchar.get(Gnss.GPS)
-            self._ephemerides.add(stamp + self._time_offset, read.records, klobuchar)
-            self._knows_ionosphere = self._knows_ionosphere or klobuchar is not None
+            stamp += self._time_offset
+            self._ephemerides.add(stamp, read.records, read.klobuchar.get(Gnss.GPS))
+            if Gnss.QZSS in read.klobuchar:
+                self._ionosphere_stand_in.add(stamp, np.zeros(0, EPHEMERIS), read.klobuchar[Gnss.QZSS])
+            self._knows_ionosphere = self._knows_ionosphere or bool(KLOBUCHAR_SOURCES & read.klobuchar.keys())
 
     def take_ranges(self, stamp: int, points: NDArray[Any], arrival: int = 0) -> PointSolution | None:
         """Give the points of a message of `gnss/ranges` to the navigator; return the point solution if one was made."""
         try:
             epoch = read_epoch(points)
         except CloudError as error:
-            self.refused[f"ranges: {error}"] += 1
+            self._note_message({f"ranges: {error}": 1})
             return None
         if math.isnan(epoch.seconds):
-            self.refused["ranges: no time tag in the epoch"] += 1
+            self._note_message({"ranges: no time tag in the epoch": 1})
             return None
-        if epoch.left_out:
-            self.refused["ranges: signals beyond the first 200 of an epoch"] += epoch.left_out
+        left_out = {"ranges: signals beyond the first 200 of an epoch": epoch.left_out}
+        self._note_message(left_out if epoch.left_out else {})
         self.epochs += 1
-        ephemerides, klobuchar = self._ephemerides.at(stamp + self._time_offset)
+        ephemerides, klobuchar = self._serving(stamp + self._time_offset)
         if self._solves:
             solution = self._solution(epoch, ephemerides, klobuchar)
-            self._navigator.range_statuses.update(Status(status) for status in epoch.ranges["status"].tolist())
-            self._push_solution(stamp + self._time_offset, solution, arrival)
+            statuses = status_counts(epoch.ranges)
+            self._recent_statuses.append(statuses)
+            self._navigator.range_statuses.update(statuses)
+            self._push_solution(stamp, solution, arrival)
             return solution
         instant = (epoch.week, epoch.seconds)
         signals = measured_epoch(epoch.ranges, *instant, ephemerides, masks=self._masks)
+        self._recent_statuses.append(status_counts(signals))
         self._navigator.push_ranges(stamp, instant, signals, klobuchar, arrival)
         return self._solution(epoch, ephemerides, klobuchar) if self.wants_solution else None
+
+    def _serving(self, stamp: int) -> tuple[Ephemerides, NDArray[np.float64]]:
+        """Return the ephemerides and the parameters of the ionosphere for an epoch with this stamp (ns)."""
+        ephemerides, klobuchar = self._ephemerides.at(stamp)
+        _, stand_in = self._ionosphere_stand_in.at(stamp)
+        return ephemerides, stand_in if np.isnan(klobuchar).any() else klobuchar
 
     def _solution(self, epoch: Epoch, ephemerides: Ephemerides, klobuchar: NDArray[np.float64]) -> PointSolution:
         """Solve the epoch alone, as a receiver would; from nothing, so that the order of epochs leaves no trace."""
@@ -155,29 +199,62 @@ class RangeIntake:
                 COVARIANCE_KNOWN,
                 STATUS_FIX,
                 arrival,
+                from_ranges=True,
             )
         if solution.velocity_status == SolutionStatus.SOLVED:
             covariance = solution.velocity_covariance_enu.ravel()
-            self._navigator.push_gnss_velocity(stamp, solution.velocity_enu.tolist(), covariance, arrival)
+            velocity = solution.velocity_enu.tolist()
+            self._navigator.push_gnss_velocity(stamp, velocity, covariance, arrival, from_ranges=True)
+
+    def _note_message(self, refused: Mapping[str, int]) -> None:
+        """Take note of a message of either topic: what of it could not be used, by reason."""
+        self.refused.update(refused)
+        self._recently_refused.append(Counter(refused))
 
     @property
     def complaints(self) -> list[str]:
-        """What is wrong with the messages, one sentence each with what to do; empty when nothing is."""
-        found = [f"{count} times: {reason}" for reason, count in self.refused.items()]
-        if self.epochs and not self._knows_ionosphere:
-            found.append(
-                "no parameters of the ionosphere came with the ephemerides: those of a middling day stand in for them"
-            )
-        statuses = self._navigator.range_statuses
-        total = sum(statuses.values()) - statuses[Status.OTHER_SIGNAL]
-        for status, count in statuses.items():
-            if status not in NORMAL and count > BLAMED_SHARE * total:
-                remedy = REMEDIES.get(status, "")
-                found.append(
-                    f"{count} of {total} signals cannot be used ({status.name.lower()})"
-                    + (f": {remedy}" * bool(remedy))
-                )
-        return found
+        """What was wrong with the messages from the first to the last, one sentence each with what to do."""
+        refused = [f"{count} times: {reason}" for reason, count in self.refused.items()]
+        return [*self.notes, *refused, *self._ionosphere_complaints(), *blamed(self._navigator.range_statuses)]
+
+    @property
+    def recent_complaints(self) -> list[str]:
+        """What is wrong with the messages at the moment: judged by the last `RECENT` of them, whatever came before."""
+        messages = len(self._recently_refused)
+        refused = [
+            f"{reason} ({count} in the last {messages} messages of ranges and ephemerides)"
+            for reason, count in added(self._recently_refused).items()
+        ]
+        return [*refused, *self._ionosphere_complaints(), *blamed(added(self._recent_statuses), "the last ")]
+
+    def _ionosphere_complaints(self) -> list[str]:
+        if not self.epochs or self._knows_ionosphere:
+            return []
+        return ["no parameters of the ionosphere came with the ephemerides: those of a middling day stand in for them"]
+
+
+def blamed(statuses: Mapping[Status, int], which: str = "") -> list[str]:
+    """Say why most signals cannot be used, if so, and what to do; ``which``: signals these are."""
+    total = sum(statuses.values()) - statuses.get(Status.OTHER_SIGNAL, 0)
+    found = []
+    for status, count in statuses.items():
+        if status not in NORMAL and count > BLAMED_SHARE * total:
+            remedy = f": {REMEDIES[status]}" if status in REMEDIES else ""
+            found.append(f"{count} of {which}{total} signals cannot be used ({status.name.lower()}){remedy}")
+    return found
+
+
+def added(counts: Iterable[Counter[Key]]) -> Counter[Key]:
+    """Add up counts."""
+    total: Counter[Key] = Counter()
+    for one in counts:
+        total.update(one)
+    return total
+
+
+def faults_of(records: NDArray[np.void]) -> Counter[str]:
+    """Count the ephemerides (EPHEMERIS) that no satellite will be placed by, by what is wrong with them."""
+    return Counter(FAULTS[Fault(fault)] for fault in check(records).tolist() if fault != Fault.NONE)
 
 
 def compile_ranges(parameters: Parameters) -> None:
