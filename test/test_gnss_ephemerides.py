@@ -17,7 +17,15 @@ from eskf_ros.gnss import orbits, ranges
 from eskf_ros.gnss.ephemeris import EPHEMERIS, NO_ISSUE, Ephemerides, Fault, Message, glonass_record, kepler_record
 from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, SATELLITE_KNOWN, Status, allocate_ranges, choose, locate
 from eskf_ros.gnss.rinex_nav import read_navigation
-from eskf_ros.gnss.signals import SIGNAL_BY_CODE, SIGNAL_BY_UBLOX, SIGNALS, SPEED_OF_LIGHT, Gnss, carrier_hz
+from eskf_ros.gnss.signals import (
+    SIGNAL_BY_CODE,
+    SIGNAL_BY_UBLOX,
+    SIGNALS,
+    SPEED_OF_LIGHT,
+    Gnss,
+    carrier_hz,
+    is_upper_band,
+)
 
 WEEK, TOE = texts.WEEK, texts.TOE
 CLOCK = {"af0": 1e-4, "af1": 0.0}
@@ -330,15 +338,27 @@ def test_no_measurement_is_fatal(rows: list[tuple[int, int, int, float, float]],
     assert sum(ranges.status_counts(observed).values()) == len(rows)
 
 
-def test_one_per_satellite_takes_l1() -> None:
+def given(observed: NDArray[np.void]) -> list[tuple[int, int, str, int]]:
+    """Constellation, satellite, signal and what it gives, of one code and one Doppler per satellite."""
+    picked = ranges.one_per_satellite(observed)
+    return [(row["gnss_id"], row["sv_id"], SIGNALS[row["signal"]].code, row["flags"]) for row in picked]
+
+
+def test_one_per_satellite_takes_code_of_the_upper_band_only() -> None:
+    """What another band has is its Doppler, where the upper band has none."""
     observed = epoch((Gnss.GPS, 5, "5Q"), (Gnss.GPS, 5, "1C"), (Gnss.GALILEO, 5, "7Q"), (Gnss.GPS, 6, "2L"))
     observed["status"] = Status.USABLE
-    picked = ranges.one_per_satellite(observed)
-    names = [(row["gnss_id"], row["sv_id"], SIGNALS[row["signal"]].code) for row in picked]
-    assert names == [(0, 5, "1C"), (0, 6, "2L"), (2, 5, "7Q")]
-    observed["status"][1] = Status.UNHEALTHY
-    assert SIGNALS[ranges.one_per_satellite(observed)[0]["signal"]].code == "5Q"
-    assert len(ranges.one_per_satellite(observed[:0])) == 0
+    observed["carrier_hz"] = [SIGNALS[row["signal"]].carrier_hz for row in observed]
+    both = CODE_VALID | DOPPLER_VALID
+    others = [(0, 6, "2L", DOPPLER_VALID), (2, 5, "7Q", DOPPLER_VALID)]
+    assert given(observed) == [(0, 5, "1C", both), *others]
+    observed["flags"][1] = CODE_VALID
+    assert given(observed) == [(0, 5, "1C", CODE_VALID), (0, 5, "5Q", DOPPLER_VALID), *others]
+    observed["cn0"][1] = 20.0
+    assert given(observed) == [(0, 5, "5Q", DOPPLER_VALID), *others]
+    observed["cn0"][1], observed["status"][1] = 45.0, Status.UNHEALTHY
+    assert given(observed) == [(0, 5, "5Q", DOPPLER_VALID), *others]
+    assert given(observed[:0]) == []
 
 
 def test_the_ionosphere_free_combination_is_free_of_it() -> None:
@@ -359,6 +379,15 @@ def test_the_ionosphere_free_combination_is_free_of_it() -> None:
 
 
 def test_signals() -> None:
+    upper = {signal.code[0] for k, signal in enumerate(SIGNALS) if is_upper_band(k, math.nan)}
+    lower = {signal.code[0] for k, signal in enumerate(SIGNALS) if not is_upper_band(k, signal.carrier_hz)}
+    # BeiDou's B1I is band 2 of RINEX.
+    assert upper == {"1", "2"}
+    assert lower == {"2", "3", "5", "6", "7", "8"}
+    assert is_upper_band(SIGNAL_BY_CODE[Gnss.BEIDOU, "2I"], math.nan)
+    assert not is_upper_band(SIGNAL_BY_CODE[Gnss.GPS, "2W"], math.nan)
+    # Of a signal without a name the carrier decides.
+    assert [is_upper_band(ranges.UNKNOWN_SIGNAL, hz) for hz in (1598e6, 1278.75e6, math.nan)] == [True, False, True]
     assert len({(signal.gnss, signal.code) for signal in SIGNALS}) == len(SIGNALS) < ranges.UNKNOWN_SIGNAL
     named = {(Gnss.GPS, 0): "1C", (Gnss.GPS, 3): "2L", (Gnss.GALILEO, 0): "1C", (Gnss.BEIDOU, 1): "2I"}
     named |= {(Gnss.BEIDOU, 5): "1P", (Gnss.BEIDOU, 7): "5P", (Gnss.QZSS, 5): "2L", (Gnss.GLONASS, 2): "2C"}
