@@ -91,7 +91,7 @@ def test_galileo_looks_back_rather_than_ahead() -> None:
     """Its orbits are fitted to the hours after toe: 40 minutes later is better than 20 minutes too early."""
     both = store(galileo(toe=TOE, issue=1.0), galileo(toe=TOE + 3600.0, issue=2.0))
     assert chosen(both, TOE + 2400.0, gnss=Gnss.GALILEO, sv_id=11)["issue"] == 1
-    assert chosen(both, TOE + 3600.0, gnss=Gnss.GALILEO, sv_id=11)["issue"] == 2
+    assert chosen(both, TOE + 4200.0, gnss=Gnss.GALILEO, sv_id=11)["issue"] == 2
 
 
 def test_an_issue_can_be_asked_for() -> None:
@@ -107,6 +107,39 @@ def test_a_new_warning_is_not_evaded_with_an_old_ephemeris() -> None:
     assert chosen(warned, TOE - 60.0)["unhealthy"] == 0
     assert chosen(warned, TOE + 60.0) == Status.UNHEALTHY
     assert chosen(warned, TOE + 7200.0) == Status.UNHEALTHY
+
+
+def test_an_ephemeris_serves_from_when_it_was_sent() -> None:
+    """A navigation file knows the next issue before the satellite sends it; it does without where it must."""
+    first = gps(toe=TOE, issue=1.0, sent=TOE - 7200.0)
+    second = gps(toe=TOE + 7200.0, issue=2.0, sent=TOE + 3900.0)
+    both = store(first, second)
+    # The second is closer from TOE + 3600 on.
+    assert chosen(both, TOE + 3899.0)["issue"] == 1
+    assert chosen(both, TOE + 3901.0)["issue"] == 2
+    # Files that begin late, and files that do not tell when.
+    assert chosen(store(second), TOE + 3601.0)["issue"] == 2
+    assert chosen(store(first, gps(toe=TOE + 7200.0, issue=2.0, sent=math.nan)), TOE + 3601.0)["issue"] == 2
+    # Of two yet to come the closer one.
+    third = gps(toe=TOE + 14400.0, issue=3.0, sent=TOE + 7200.0)
+    assert chosen(store(second, third), TOE + 3700.0)["issue"] == 2
+    assert chosen(store(second, third), TOE + 7300.0)["issue"] == 2
+
+
+def test_a_warning_holds_from_when_it_was_sent() -> None:
+    warning = gps(toe=TOE + 7200.0, issue=2.0, sent=TOE + 3900.0, health=63.0)
+    both = store(gps(toe=TOE, issue=1.0, sent=TOE - 7200.0), warning)
+    assert chosen(both, TOE + 3899.0)["issue"] == 1
+    assert chosen(both, TOE + 3901.0) == Status.UNHEALTHY
+    assert chosen(store(warning), TOE + 3601.0) == Status.UNHEALTHY
+
+
+def test_a_message_that_has_been_sent_goes_before_a_better_one_to_come() -> None:
+    fields = {**texts.MEO, **CLOCK, "tgd": -1e-8, "isc_l1ca": 0.0}
+    modern = kepler_record(Gnss.GPS, 5, Message.CNAV, (WEEK, TOE), {**fields, "sent": TOE - 7200.0})
+    both = store(gps(sent=TOE + 60.0), modern)
+    assert chosen(both, TOE)["message"] == Message.CNAV
+    assert chosen(both, TOE + 60.0)["message"] == Message.LNAV
 
 
 def test_health_of_one_signal_leaves_the_others() -> None:

@@ -413,13 +413,14 @@ def choose(records, first, gnss_id, sv_id, slot, week, seconds, issue):
 
     Of the messages in their time (``max_lead``, ``max_age``) that give the group delay of ``slot``: the one first in
     `ephemeris.Message`, and of its issues the one whose reference time is closest, as a share of the time allowed; with
-    ``issue`` (not `NO_ISSUE`) only that issue. The satellite is unhealthy when this ephemeris says so, or the one sent
-    last before the instant: an old good one is no way around a new warning.
+    ``issue`` (not `NO_ISSUE`) only that issue. What was sent only after the instant serves where nothing else does. The
+    satellite is unhealthy when this ephemeris says so, or the one sent last before the instant: an old good one is no
+    way around a new warning.
     """
     if not (0 <= gnss_id < GNSS_COUNT and 0 <= sv_id < SATELLITE_KEYS):
         return -1, _NO_EPHEMERIS
     key = SATELLITE_KEYS * gnss_id + sv_id
-    chosen, message, closest = -1, 0, math.inf
+    chosen, message, closest, ahead = -1, 0, math.inf, False
     newest, warned = -math.inf, False
     reason = _NO_EPHEMERIS
     for k in range(first[key], first[key + 1]):
@@ -434,14 +435,18 @@ def choose(records, first, gnss_id, sv_id, slot, week, seconds, issue):
         if slot < 0 or math.isnan(ephemeris["group_delay"][slot]):
             reason = max(reason, _NO_GROUP_DELAY)
             continue
-        if chosen >= 0 and ephemeris["message"] > message:
+        # NaN where it is not known: what the receiver has, has been sent.
+        until_sent = elapsed(ephemeris["sent_week"], ephemeris["sent"], week, seconds)
+        unsent = until_sent > 0.0
+        later_message = chosen >= 0 and ephemeris["message"] > message
+        if later_message and not ahead:
             break
-        since_sent = elapsed(ephemeris["sent_week"], ephemeris["sent"], week, seconds)
-        if newest < since_sent <= 0.0:
-            newest = since_sent
+        if newest < until_sent <= 0.0:
+            newest = until_sent
             warned = (ephemeris["unhealthy"] >> slot) & 1 != 0
-        if age <= closest:
-            chosen, message, closest = k, ephemeris["message"], age
+        replaces = age <= closest and not later_message
+        if chosen < 0 or (ahead and not unsent) or (ahead == unsent and replaces):
+            chosen, message, closest, ahead = k, ephemeris["message"], age, unsent
     if chosen < 0:
         return -1, reason
     if warned or (records[chosen]["unhealthy"] >> slot) & 1:
