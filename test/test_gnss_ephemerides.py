@@ -309,6 +309,18 @@ def test_satellites_that_come_with_the_range_are_kept() -> None:
     assert observed["carrier_hz"][0] == 1575.42e6
 
 
+@pytest.mark.parametrize("gnss_id", [-1, 4, 7, 8, 250])
+def test_a_constellation_that_is_not_known_is_not_taken_for_another(gnss_id: int) -> None:
+    """NavIC (7) has its own time and L5; its satellites may come with their states all the same."""
+    observed = epoch((Gnss.GPS, 5, "1C"), (Gnss.GPS, 6, "1C"), (Gnss.GPS, 7, "1C"))
+    observed["flags"] |= SATELLITE_KNOWN
+    observed["satellite"], observed["satellite_velocity"] = [2e7, 1e7, 5e6], [1.0, 2.0, 3.0]
+    observed["satellite_clock"], observed["satellite_clock_drift"] = 1e-4, 0.0
+    observed["gnss_id"][:2] = gnss_id, Gnss.SBAS
+    locate(observed, WEEK, TOE, Ephemerides())
+    assert list(observed["status"]) == [Status.UNKNOWN_SIGNAL, Status.USABLE, Status.USABLE]
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [

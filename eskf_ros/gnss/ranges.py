@@ -17,8 +17,8 @@ from eskf_ros.compiled import njit
 from eskf_ros.gnss.ephemeris import NO_ISSUE, SATELLITE_KEYS, Ephemerides
 from eskf_ros.gnss.orbits import satellite_state, transmission
 from eskf_ros.gnss.signals import (
-    BEIDOU_3,
     GNSS_COUNT,
+    IS_CONSTELLATION,
     L1,
     SIGNAL_CARRIER_HZ,
     SIGNAL_GNSS,
@@ -344,8 +344,8 @@ def locate_one(observed, week, seconds, records, first):
         observed["carrier_hz"] = SIGNAL_CARRIER_HZ[signal] if known_signal and gnss != _GLONASS else math.nan
     if observed["flags"] & CLOCK_APPLIED:
         observed["satellite_clock"] = 0.0
-    if not 0 <= gnss < GNSS_COUNT or gnss == BEIDOU_3:
-        # It is an index into tables of constellations.
+    if not 0 <= gnss < GNSS_COUNT or not IS_CONSTELLATION[gnss]:
+        # It is an index into tables of constellations; a satellite of no system here has a time of its own.
         observed["status"] = _UNKNOWN_SIGNAL
         return
     if observed["flags"] & SATELLITE_KNOWN:

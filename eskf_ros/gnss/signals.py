@@ -44,6 +44,9 @@ class Gnss(IntEnum):
 GNSS_COUNT = 8
 """Length of a table indexed by ``gnss_id`` or `time_group`."""
 
+IS_CONSTELLATION = np.isin(np.arange(GNSS_COUNT), list(Gnss))
+"""By ``gnss_id``: whether it is one of `Gnss`."""
+
 BEIDOU_3 = 4
 """`time_group` of the satellites of BeiDou-3 (a ``gnss_id`` that no constellation has)."""
 
