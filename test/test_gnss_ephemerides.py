@@ -15,7 +15,17 @@ from numpy.typing import NDArray
 
 from eskf_ros.gnss import orbits, ranges
 from eskf_ros.gnss.ephemeris import EPHEMERIS, NO_ISSUE, Ephemerides, Fault, Message, glonass_record, kepler_record
-from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, SATELLITE_KNOWN, Status, allocate_ranges, choose, locate
+from eskf_ros.gnss.ranges import (
+    ALREADY_TURNED,
+    CLOCK_APPLIED,
+    CODE_VALID,
+    DOPPLER_VALID,
+    SATELLITE_KNOWN,
+    Status,
+    allocate_ranges,
+    choose,
+    locate,
+)
 from eskf_ros.gnss.rinex_nav import read_navigation
 from eskf_ros.gnss.signals import (
     SIGNAL_BY_CODE,
@@ -330,7 +340,6 @@ def test_a_constellation_that_is_not_known_is_not_taken_for_another(gnss_id: int
         ("satellite_clock", 0.2),
         ("satellite_clock", math.inf),
         ("satellite_clock_drift", 1e-3),
-        ("satellite_clock_drift", math.nan),
     ],
 )
 def test_impossible_satellites_do_not_pass_the_door(name: str, value: Any) -> None:
@@ -341,6 +350,27 @@ def test_impossible_satellites_do_not_pass_the_door(name: str, value: Any) -> No
     observed[name][1] = value
     locate(observed, WEEK, TOE, Ephemerides())
     assert list(observed["status"]) == [Status.USABLE, Status.BAD_VALUE]
+
+
+def test_a_satellite_without_its_clock_is_taken_from_the_ephemerides(tmp_path: Path) -> None:
+    """NaN is what a missing field is: no drift, and no satellite state; unless the clock is taken out already."""
+    ephemerides = everything(tmp_path)
+    plain = epoch((Gnss.GPS, 5, "1C"))
+    locate(plain, WEEK, TOE, ephemerides)
+    given_state = epoch(*[(Gnss.GPS, 5, "1C")] * 3)
+    given_state["flags"] |= SATELLITE_KNOWN | ALREADY_TURNED
+    given_state["flags"][2] |= CLOCK_APPLIED
+    given_state["satellite"], given_state["satellite_velocity"] = [2e7, 1e7, 5e6], [1.0, 2.0, 3.0]
+    given_state["satellite_clock"] = [math.nan, 1e-4, math.nan]
+    located = given_state.copy()
+    locate(located, WEEK, TOE, ephemerides)
+    assert (located["status"] == Status.USABLE).all()
+    assert located[0].tobytes() == plain[0].tobytes()
+    np.testing.assert_array_equal(located["satellite"][1:], given_state["satellite"][1:])
+    assert located["satellite_clock"][1:].tolist() == [1e-4, 0.0]
+    assert located["satellite_clock_drift"][1:].tolist() == [0.0, 0.0]
+    locate(given_state, WEEK, TOE, Ephemerides())
+    assert list(given_state["status"]) == [Status.NO_EPHEMERIS, Status.USABLE, Status.USABLE]
 
 
 def test_impossible_numbers_become_unknown(tmp_path: Path) -> None:

@@ -348,7 +348,12 @@ def locate_one(observed, week, seconds, records, first):
         # It is an index into tables of constellations; a satellite of no system here has a time of its own.
         observed["status"] = _UNKNOWN_SIGNAL
         return
+    if math.isnan(observed["satellite_clock"]):
+        # A position alone is no satellite state: without its clock a range is 100 km off. The ephemerides have both.
+        observed["flags"] &= ~(SATELLITE_KNOWN | ALREADY_TURNED)
     if observed["flags"] & SATELLITE_KNOWN:
+        if math.isnan(observed["satellite_clock_drift"]):
+            observed["satellite_clock_drift"] = 0.0
         velocity = observed["satellite_velocity"]
         if math.isnan(velocity[0] + velocity[1] + velocity[2]):
             observed["flags"] &= ~DOPPLER_VALID
