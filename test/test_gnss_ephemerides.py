@@ -152,6 +152,13 @@ def test_a_message_that_has_been_sent_goes_before_a_better_one_to_come() -> None
     assert chosen(both, TOE + 60.0)["message"] == Message.LNAV
 
 
+def test_health_flags_that_were_not_broadcast_are_no_illness() -> None:
+    fields = dict.fromkeys(GLONASS_NAMES, 1.0)
+    for flags, ill in ((0.0, False), (4.0, True), (3.0, False), (999999999.0, False), (math.nan, False)):
+        record = glonass_record(1, (WEEK, TOE), 18, {**fields, "flags": flags})
+        assert bool(record["unhealthy"]) == ill
+
+
 def test_health_of_one_signal_leaves_the_others() -> None:
     sick = store(galileo(health=0b000_010_000))
     assert chosen(sick, TOE, "5Q", Gnss.GALILEO, 11) == Status.UNHEALTHY

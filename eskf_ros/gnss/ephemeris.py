@@ -243,7 +243,7 @@ def glonass_record(sv_id: int, tb_utc: Instant, leap: int, fields: Fields) -> np
     for name, axes in (("position", "xyz"), ("velocity", ("vx", "vy", "vz")), ("acceleration", ("ax", "ay", "az"))):
         record[name] = [1e3 * fields.get(axis, math.nan) for axis in axes]
     record["group_delay"] = group_delays(Gnss.GLONASS, Message.FDMA, fields)
-    ill = _integer(fields.get("health", math.nan), 0) != 0 or _integer(fields.get("flags", math.nan), 0) & 4
+    ill = _integer(fields.get("health", math.nan), 0) != 0 or _integer(_broadcast(fields, "flags"), 0) & 4
     record["unhealthy"] = ALL_SLOTS if ill else 0
     return record
 
