@@ -208,6 +208,40 @@ def test_the_store_does_not_depend_on_the_order_of_arrival(order: list[int], cut
     np.testing.assert_array_equal(mixed.first, once.first)
 
 
+def test_what_is_known_already_changes_nothing() -> None:
+    """A receiver repeats its ephemerides: they are counted, and nothing is sorted anew."""
+    full = store(gps(issue=1.0), gps(toe=TOE + 7200.0, issue=2.0), galileo())
+    before = full.records
+    full.add(before[::2])
+    assert full.records is before
+    assert full.refused[Fault.DUPLICATE] == 2
+    news = np.array([gps(issue=1.0), gps(toe=TOE + 14400.0, issue=3.0), gps(9, e=math.nan)], EPHEMERIS)
+    assert full.unknown(news).tobytes() == news[1:2].tobytes()
+    full.add(news)
+    assert len(full) == 4
+    assert len(full.unknown(news)) == 0
+
+
+@given(st.integers(0, 40000), st.integers(0, 40000))
+def test_what_has_ended_is_forgotten_unnoticed(late: int, later: int) -> None:
+    """At that instant and from then on each signal gets what it got before, or the same reason why there is none."""
+    pool = [gps(5, TOE + 3600.0 * k, issue=float(k)) for k in range(6)]
+    pool += [gps(6, fit=6.0), gps(7, TOE + 50000.0), galileo()]
+    pool += [galileo(Message.FNAV, TOE + 600.0 * k) for k in range(9)]
+    full, pruned = store(*pool), store(*pool)
+    pruned.drop_ended(WEEK, TOE + late)
+    signals = [("1C", Gnss.GPS, 5), ("1C", Gnss.GPS, 6), ("1C", Gnss.GPS, 7), ("5Q", Gnss.GALILEO, 11)]
+    for seconds in (TOE + late, TOE + late + later):
+        for signal in signals:
+            # As text, in which NaN equals NaN.
+            assert str(chosen(pruned, seconds, *signal)) == str(chosen(full, seconds, *signal))
+    assert chosen(pruned, TOE, sv_id=8) == Status.NO_EPHEMERIS
+    # Of each message of a satellite one is left.
+    pruned.drop_ended(WEEK + 1, TOE)
+    assert len(pruned) == 5
+    Ephemerides().drop_ended(WEEK, TOE)
+
+
 def test_records_have_no_gaps() -> None:
     """Their bytes decide between two of one issue."""
     assert EPHEMERIS.itemsize == sum(dtype.itemsize for dtype, _ in EPHEMERIS.fields.values())  # type: ignore[union-attr]
