@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from gnss_sky import KLOBUCHAR, all_constellations
+from gnss_sky import SECONDS as GPS_SECONDS
+from gnss_sky import WEEK as GPS_WEEK
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -14,7 +16,8 @@ from eskf_ros.gnss.cloud import write_epoch
 from eskf_ros.gnss.dated_ephemerides import LARGEST_LEAD, DatedEphemerides
 from eskf_ros.gnss.ephemeris import EPHEMERIS, Broadcast
 from eskf_ros.gnss.ephemeris_cloud import write_ephemerides
-from eskf_ros.gnss.ranges import Status
+from eskf_ros.gnss.ranges import CODE_VALID, Status, allocate_ranges, locate
+from eskf_ros.gnss.time import normalized
 from eskf_ros.parameters import from_mapping
 from eskf_ros.ranges.intake import RangeIntake
 from eskf_ros.simulate.range_receiver import RangeMeasurements, RangeReceiver
@@ -65,6 +68,72 @@ def test_what_is_settled_stays_and_is_not_kept_twice() -> None:
         assert len(found) == max(0, k - 1)
         assert klobuchar.tolist() == KLOBUCHAR.tolist()
         assert len(kept._messages) <= 5
+
+
+def test_what_is_sent_again_is_not_kept() -> None:
+    kept = DatedEphemerides(RECORDS[:1], KLOBUCHAR, WINDOW)
+    for k in range(9):
+        kept.add(START + k * SECOND, RECORDS[:3], None)
+        found, _ = kept.at(START + k * SECOND)
+    assert len(found) == 3
+    assert len(kept._messages) == 0
+    # Parameters of the ionosphere are in force again when they are sent again.
+    for k, number in enumerate((1, 2, 1)):
+        kept.add(START + (20 + k) * SECOND, RECORDS[:3], ionosphere(number))
+    assert kept.at(START + 40 * SECOND)[1][0] == 1.0
+
+
+def issue(number: int, half: int) -> np.void:
+    """The ephemeris of a satellite for the given half hour of the day."""
+    record = RECORDS[number].copy()
+    for name in ("toe", "toc", "toe_own"):
+        record[name] += 1800.0 * half
+    record["issue"] = half
+    return record
+
+
+@given(st.integers(0, 2**32))
+def test_what_has_ended_is_forgotten_unnoticed(seed: int) -> None:
+    """Each epoch of a day locates its signals as without forgetting, late by anything within the window."""
+    rng = np.random.default_rng(seed)
+    forgetful, faithful = (DatedEphemerides(RECORDS[:2], KLOBUCHAR, WINDOW) for _ in range(2))
+    ranges = allocate_ranges(4)
+    ranges["sv_id"], ranges["signal"] = RECORDS["sv_id"][:4], 0
+    ranges["pseudorange"], ranges["flags"] = 2.2e7, CODE_VALID
+    events = []
+    for half in range(48):
+        stamp = START + 1800 * half * SECOND
+        # The third satellite sends no more after a while, the fourth does all day.
+        if half < 12:
+            events.append((stamp + int(rng.integers(WINDOW)), stamp, issue(2, half), 0.0))
+        events.append((stamp + int(rng.integers(WINDOW)), stamp, issue(3, half), 0.0))
+        for _ in range(3):
+            later = int(rng.integers(1800))
+            stamp = START + (1800 * half + later) * SECOND
+            events.append((stamp + int(rng.integers(WINDOW)), stamp, None, 1800.0 * half + later))
+    for _, stamp, record, since in sorted(events, key=lambda event: event[0]):
+        if record is not None:
+            for kept in (forgetful, faithful):
+                kept.add(stamp, np.array([record], EPHEMERIS), None)
+            continue
+        instant = normalized(GPS_WEEK, GPS_SECONDS + since)
+        epochs = [ranges.copy(), ranges.copy()]
+        for epoch, ephemerides in zip(epochs, (forgetful.at(stamp, instant)[0], faithful.at(stamp)[0])):
+            locate(epoch, *instant, ephemerides)
+        assert epochs[0].tobytes() == epochs[1].tobytes()
+        assert len(forgetful.at(stamp, instant)[0]) < 20
+    assert len(faithful.at(stamp)[0]) > 55
+
+
+def test_one_wrong_time_tag_forgets_nothing() -> None:
+    kept = DatedEphemerides(NONE, KLOBUCHAR, WINDOW)
+    kept.add(0, np.array([issue(0, 0), issue(0, 1)], EPHEMERIS), None)
+    for k, week in enumerate((GPS_WEEK, GPS_WEEK, GPS_WEEK + 1024, GPS_WEEK, 0, GPS_WEEK)):
+        assert len(kept.at(START + k * SECOND, (week, GPS_SECONDS + k))[0]) == 2
+    # Two in a row do, but for the last of each satellite.
+    for k in (6, 7):
+        kept.at(START + k * SECOND, (GPS_WEEK + 1024, GPS_SECONDS + k))
+    assert len(kept.at(START + 8 * SECOND, (GPS_WEEK, GPS_SECONDS + 8))[0]) == 1
 
 
 @pytest.mark.parametrize("stamp", [0, START + LARGEST_LEAD + 1, 3 * START])

@@ -15,9 +15,27 @@ from numpy.typing import NDArray
 
 from eskf_ros.gnss import orbits, ranges
 from eskf_ros.gnss.ephemeris import EPHEMERIS, NO_ISSUE, Ephemerides, Fault, Message, glonass_record, kepler_record
-from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, SATELLITE_KNOWN, Status, allocate_ranges, choose, locate
+from eskf_ros.gnss.ranges import (
+    ALREADY_TURNED,
+    CLOCK_APPLIED,
+    CODE_VALID,
+    DOPPLER_VALID,
+    SATELLITE_KNOWN,
+    Status,
+    allocate_ranges,
+    choose,
+    locate,
+)
 from eskf_ros.gnss.rinex_nav import read_navigation
-from eskf_ros.gnss.signals import SIGNAL_BY_CODE, SIGNAL_BY_UBLOX, SIGNALS, SPEED_OF_LIGHT, Gnss, carrier_hz
+from eskf_ros.gnss.signals import (
+    SIGNAL_BY_CODE,
+    SIGNAL_BY_UBLOX,
+    SIGNALS,
+    SPEED_OF_LIGHT,
+    Gnss,
+    carrier_hz,
+    is_upper_band,
+)
 
 WEEK, TOE = texts.WEEK, texts.TOE
 CLOCK = {"af0": 1e-4, "af1": 0.0}
@@ -83,7 +101,7 @@ def test_galileo_looks_back_rather_than_ahead() -> None:
     """Its orbits are fitted to the hours after toe: 40 minutes later is better than 20 minutes too early."""
     both = store(galileo(toe=TOE, issue=1.0), galileo(toe=TOE + 3600.0, issue=2.0))
     assert chosen(both, TOE + 2400.0, gnss=Gnss.GALILEO, sv_id=11)["issue"] == 1
-    assert chosen(both, TOE + 3600.0, gnss=Gnss.GALILEO, sv_id=11)["issue"] == 2
+    assert chosen(both, TOE + 4200.0, gnss=Gnss.GALILEO, sv_id=11)["issue"] == 2
 
 
 def test_an_issue_can_be_asked_for() -> None:
@@ -99,6 +117,46 @@ def test_a_new_warning_is_not_evaded_with_an_old_ephemeris() -> None:
     assert chosen(warned, TOE - 60.0)["unhealthy"] == 0
     assert chosen(warned, TOE + 60.0) == Status.UNHEALTHY
     assert chosen(warned, TOE + 7200.0) == Status.UNHEALTHY
+
+
+def test_an_ephemeris_serves_from_when_it_was_sent() -> None:
+    """A navigation file knows the next issue before the satellite sends it; it does without where it must."""
+    first = gps(toe=TOE, issue=1.0, sent=TOE - 7200.0)
+    second = gps(toe=TOE + 7200.0, issue=2.0, sent=TOE + 3900.0)
+    both = store(first, second)
+    # The second is closer from TOE + 3600 on.
+    assert chosen(both, TOE + 3899.0)["issue"] == 1
+    assert chosen(both, TOE + 3901.0)["issue"] == 2
+    # Files that begin late, and files that do not tell when.
+    assert chosen(store(second), TOE + 3601.0)["issue"] == 2
+    assert chosen(store(first, gps(toe=TOE + 7200.0, issue=2.0, sent=math.nan)), TOE + 3601.0)["issue"] == 2
+    # Of two yet to come the closer one.
+    third = gps(toe=TOE + 14400.0, issue=3.0, sent=TOE + 7200.0)
+    assert chosen(store(second, third), TOE + 3700.0)["issue"] == 2
+    assert chosen(store(second, third), TOE + 7300.0)["issue"] == 2
+
+
+def test_a_warning_holds_from_when_it_was_sent() -> None:
+    warning = gps(toe=TOE + 7200.0, issue=2.0, sent=TOE + 3900.0, health=63.0)
+    both = store(gps(toe=TOE, issue=1.0, sent=TOE - 7200.0), warning)
+    assert chosen(both, TOE + 3899.0)["issue"] == 1
+    assert chosen(both, TOE + 3901.0) == Status.UNHEALTHY
+    assert chosen(store(warning), TOE + 3601.0) == Status.UNHEALTHY
+
+
+def test_a_message_that_has_been_sent_goes_before_a_better_one_to_come() -> None:
+    fields = {**texts.MEO, **CLOCK, "tgd": -1e-8, "isc_l1ca": 0.0}
+    modern = kepler_record(Gnss.GPS, 5, Message.CNAV, (WEEK, TOE), {**fields, "sent": TOE - 7200.0})
+    both = store(gps(sent=TOE + 60.0), modern)
+    assert chosen(both, TOE)["message"] == Message.CNAV
+    assert chosen(both, TOE + 60.0)["message"] == Message.LNAV
+
+
+def test_health_flags_that_were_not_broadcast_are_no_illness() -> None:
+    fields = dict.fromkeys(GLONASS_NAMES, 1.0)
+    for flags, ill in ((0.0, False), (4.0, True), (3.0, False), (999999999.0, False), (math.nan, False)):
+        record = glonass_record(1, (WEEK, TOE), 18, {**fields, "flags": flags})
+        assert bool(record["unhealthy"]) == ill
 
 
 def test_health_of_one_signal_leaves_the_others() -> None:
@@ -148,6 +206,40 @@ def test_the_store_does_not_depend_on_the_order_of_arrival(order: list[int], cut
         mixed.add(np.array([POOL[index] for index in part], EPHEMERIS))
     assert mixed.records.tobytes() == once.records.tobytes()
     np.testing.assert_array_equal(mixed.first, once.first)
+
+
+def test_what_is_known_already_changes_nothing() -> None:
+    """A receiver repeats its ephemerides: they are counted, and nothing is sorted anew."""
+    full = store(gps(issue=1.0), gps(toe=TOE + 7200.0, issue=2.0), galileo())
+    before = full.records
+    full.add(before[::2])
+    assert full.records is before
+    assert full.refused[Fault.DUPLICATE] == 2
+    news = np.array([gps(issue=1.0), gps(toe=TOE + 14400.0, issue=3.0), gps(9, e=math.nan)], EPHEMERIS)
+    assert full.unknown(news).tobytes() == news[1:2].tobytes()
+    full.add(news)
+    assert len(full) == 4
+    assert len(full.unknown(news)) == 0
+
+
+@given(st.integers(0, 40000), st.integers(0, 40000))
+def test_what_has_ended_is_forgotten_unnoticed(late: int, later: int) -> None:
+    """At that instant and from then on each signal gets what it got before, or the same reason why there is none."""
+    pool = [gps(5, TOE + 3600.0 * k, issue=float(k)) for k in range(6)]
+    pool += [gps(6, fit=6.0), gps(7, TOE + 50000.0), galileo()]
+    pool += [galileo(Message.FNAV, TOE + 600.0 * k) for k in range(9)]
+    full, pruned = store(*pool), store(*pool)
+    pruned.drop_ended(WEEK, TOE + late)
+    signals = [("1C", Gnss.GPS, 5), ("1C", Gnss.GPS, 6), ("1C", Gnss.GPS, 7), ("5Q", Gnss.GALILEO, 11)]
+    for seconds in (TOE + late, TOE + late + later):
+        for signal in signals:
+            # As text, in which NaN equals NaN.
+            assert str(chosen(pruned, seconds, *signal)) == str(chosen(full, seconds, *signal))
+    assert chosen(pruned, TOE, sv_id=8) == Status.NO_EPHEMERIS
+    # Of each message of a satellite one is left.
+    pruned.drop_ended(WEEK + 1, TOE)
+    assert len(pruned) == 5
+    Ephemerides().drop_ended(WEEK, TOE)
 
 
 def test_records_have_no_gaps() -> None:
@@ -268,6 +360,18 @@ def test_satellites_that_come_with_the_range_are_kept() -> None:
     assert observed["carrier_hz"][0] == 1575.42e6
 
 
+@pytest.mark.parametrize("gnss_id", [-1, 4, 7, 8, 250])
+def test_a_constellation_that_is_not_known_is_not_taken_for_another(gnss_id: int) -> None:
+    """NavIC (7) has its own time and L5; its satellites may come with their states all the same."""
+    observed = epoch((Gnss.GPS, 5, "1C"), (Gnss.GPS, 6, "1C"), (Gnss.GPS, 7, "1C"))
+    observed["flags"] |= SATELLITE_KNOWN
+    observed["satellite"], observed["satellite_velocity"] = [2e7, 1e7, 5e6], [1.0, 2.0, 3.0]
+    observed["satellite_clock"], observed["satellite_clock_drift"] = 1e-4, 0.0
+    observed["gnss_id"][:2] = gnss_id, Gnss.SBAS
+    locate(observed, WEEK, TOE, Ephemerides())
+    assert list(observed["status"]) == [Status.UNKNOWN_SIGNAL, Status.USABLE, Status.USABLE]
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -277,7 +381,6 @@ def test_satellites_that_come_with_the_range_are_kept() -> None:
         ("satellite_clock", 0.2),
         ("satellite_clock", math.inf),
         ("satellite_clock_drift", 1e-3),
-        ("satellite_clock_drift", math.nan),
     ],
 )
 def test_impossible_satellites_do_not_pass_the_door(name: str, value: Any) -> None:
@@ -288,6 +391,27 @@ def test_impossible_satellites_do_not_pass_the_door(name: str, value: Any) -> No
     observed[name][1] = value
     locate(observed, WEEK, TOE, Ephemerides())
     assert list(observed["status"]) == [Status.USABLE, Status.BAD_VALUE]
+
+
+def test_a_satellite_without_its_clock_is_taken_from_the_ephemerides(tmp_path: Path) -> None:
+    """NaN is what a missing field is: no drift, and no satellite state; unless the clock is taken out already."""
+    ephemerides = everything(tmp_path)
+    plain = epoch((Gnss.GPS, 5, "1C"))
+    locate(plain, WEEK, TOE, ephemerides)
+    given_state = epoch(*[(Gnss.GPS, 5, "1C")] * 3)
+    given_state["flags"] |= SATELLITE_KNOWN | ALREADY_TURNED
+    given_state["flags"][2] |= CLOCK_APPLIED
+    given_state["satellite"], given_state["satellite_velocity"] = [2e7, 1e7, 5e6], [1.0, 2.0, 3.0]
+    given_state["satellite_clock"] = [math.nan, 1e-4, math.nan]
+    located = given_state.copy()
+    locate(located, WEEK, TOE, ephemerides)
+    assert (located["status"] == Status.USABLE).all()
+    assert located[0].tobytes() == plain[0].tobytes()
+    np.testing.assert_array_equal(located["satellite"][1:], given_state["satellite"][1:])
+    assert located["satellite_clock"][1:].tolist() == [1e-4, 0.0]
+    assert located["satellite_clock_drift"][1:].tolist() == [0.0, 0.0]
+    locate(given_state, WEEK, TOE, Ephemerides())
+    assert list(given_state["status"]) == [Status.NO_EPHEMERIS, Status.USABLE, Status.USABLE]
 
 
 def test_impossible_numbers_become_unknown(tmp_path: Path) -> None:
@@ -330,15 +454,27 @@ def test_no_measurement_is_fatal(rows: list[tuple[int, int, int, float, float]],
     assert sum(ranges.status_counts(observed).values()) == len(rows)
 
 
-def test_one_per_satellite_takes_l1() -> None:
+def given(observed: NDArray[np.void]) -> list[tuple[int, int, str, int]]:
+    """Constellation, satellite, signal and what it gives, of one code and one Doppler per satellite."""
+    picked = ranges.one_per_satellite(observed)
+    return [(row["gnss_id"], row["sv_id"], SIGNALS[row["signal"]].code, row["flags"]) for row in picked]
+
+
+def test_one_per_satellite_takes_code_of_the_upper_band_only() -> None:
+    """What another band has is its Doppler, where the upper band has none."""
     observed = epoch((Gnss.GPS, 5, "5Q"), (Gnss.GPS, 5, "1C"), (Gnss.GALILEO, 5, "7Q"), (Gnss.GPS, 6, "2L"))
     observed["status"] = Status.USABLE
-    picked = ranges.one_per_satellite(observed)
-    names = [(row["gnss_id"], row["sv_id"], SIGNALS[row["signal"]].code) for row in picked]
-    assert names == [(0, 5, "1C"), (0, 6, "2L"), (2, 5, "7Q")]
-    observed["status"][1] = Status.UNHEALTHY
-    assert SIGNALS[ranges.one_per_satellite(observed)[0]["signal"]].code == "5Q"
-    assert len(ranges.one_per_satellite(observed[:0])) == 0
+    observed["carrier_hz"] = [SIGNALS[row["signal"]].carrier_hz for row in observed]
+    both = CODE_VALID | DOPPLER_VALID
+    others = [(0, 6, "2L", DOPPLER_VALID), (2, 5, "7Q", DOPPLER_VALID)]
+    assert given(observed) == [(0, 5, "1C", both), *others]
+    observed["flags"][1] = CODE_VALID
+    assert given(observed) == [(0, 5, "1C", CODE_VALID), (0, 5, "5Q", DOPPLER_VALID), *others]
+    observed["cn0"][1] = 20.0
+    assert given(observed) == [(0, 5, "5Q", DOPPLER_VALID), *others]
+    observed["cn0"][1], observed["status"][1] = 45.0, Status.UNHEALTHY
+    assert given(observed) == [(0, 5, "5Q", DOPPLER_VALID), *others]
+    assert given(observed[:0]) == []
 
 
 def test_the_ionosphere_free_combination_is_free_of_it() -> None:
@@ -359,6 +495,15 @@ def test_the_ionosphere_free_combination_is_free_of_it() -> None:
 
 
 def test_signals() -> None:
+    upper = {signal.code[0] for k, signal in enumerate(SIGNALS) if is_upper_band(k, math.nan)}
+    lower = {signal.code[0] for k, signal in enumerate(SIGNALS) if not is_upper_band(k, signal.carrier_hz)}
+    # BeiDou's B1I is band 2 of RINEX.
+    assert upper == {"1", "2"}
+    assert lower == {"2", "3", "5", "6", "7", "8"}
+    assert is_upper_band(SIGNAL_BY_CODE[Gnss.BEIDOU, "2I"], math.nan)
+    assert not is_upper_band(SIGNAL_BY_CODE[Gnss.GPS, "2W"], math.nan)
+    # Of a signal without a name the carrier decides.
+    assert [is_upper_band(ranges.UNKNOWN_SIGNAL, hz) for hz in (1598e6, 1278.75e6, math.nan)] == [True, False, True]
     assert len({(signal.gnss, signal.code) for signal in SIGNALS}) == len(SIGNALS) < ranges.UNKNOWN_SIGNAL
     named = {(Gnss.GPS, 0): "1C", (Gnss.GPS, 3): "2L", (Gnss.GALILEO, 0): "1C", (Gnss.BEIDOU, 1): "2I"}
     named |= {(Gnss.BEIDOU, 5): "1P", (Gnss.BEIDOU, 7): "5P", (Gnss.QZSS, 5): "2L", (Gnss.GLONASS, 2): "2C"}

@@ -7,6 +7,8 @@ import math
 import numpy as np
 import pytest
 from gnss_sky import KLOBUCHAR, SECONDS, WEEK, Receiver, all_constellations, measure, receiver_at
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
@@ -27,12 +29,14 @@ from eskf_ros.gnss.ranges import (
     SATELLITE_KNOWN,
     Status,
     locate,
+    one_per_satellite,
 )
-from eskf_ros.gnss.signals import GNSS_COUNT, SIGNAL_BY_CODE, SPEED_OF_LIGHT, Gnss, time_group
+from eskf_ros.gnss.signals import GNSS_COUNT, SIGNAL_BY_CODE, SIGNAL_CARRIER_HZ, SPEED_OF_LIGHT, Gnss, time_group
 from eskf_ros.gnss.weighting import DEFAULT_WEIGHTING
 
 SKY = all_constellations()
 SYSTEMS = (Gnss.GPS, Gnss.GALILEO, Gnss.BEIDOU, Gnss.GLONASS)
+LOWER = {Gnss.GPS: "2L", Gnss.GALILEO: "7Q", Gnss.BEIDOU: "7I", Gnss.GLONASS: "2C"}
 EVERYTHING = Masks(elevation=-math.pi, cn0=0.0, one_per_satellite=False)
 
 
@@ -51,6 +55,25 @@ def raw_epoch(receiver: Receiver) -> NDArray[np.void]:
     for name in ("satellite", "satellite_velocity", "satellite_clock", "satellite_clock_drift"):
         ranges[name] = math.nan
     return ranges
+
+
+def gives(measured: NDArray[np.void]) -> list[int]:
+    """What signals say that they give."""
+    return (measured["flags"] & (CODE_VALID | DOPPLER_VALID)).tolist()
+
+
+def two_bands(receiver: Receiver) -> NDArray[np.void]:
+    """Ranges of a receiver that delays the lower band by 8 m, of each satellite the lower band first."""
+    upper = raw_epoch(receiver)
+    lower = upper.copy()
+    lower["signal"] = [SIGNAL_BY_CODE[Gnss(gnss), LOWER[Gnss(gnss)]] for gnss in upper["gnss_id"]]
+    ratio = SIGNAL_CARRIER_HZ[lower["signal"]] / SIGNAL_CARRIER_HZ[upper["signal"]]
+    lower["pseudorange"] += 8.0
+    lower["doppler"] *= ratio
+    lower["carrier_hz"] = math.nan
+    # What their ephemerides do not tell of GLONASS.
+    lower = lower[lower["gnss_id"] != Gnss.GLONASS]
+    return np.concatenate([lower, upper])
 
 
 def predicted(measured: NDArray[np.void], receiver: Receiver) -> NDArray[np.void]:
@@ -155,7 +178,7 @@ def test_satellites_of_the_sender_need_no_ephemeris() -> None:
 
 
 def test_of_several_signals_of_a_satellite_one_is_used() -> None:
-    """The first in the list of signals, of doubles the first to come; nothing depends on the order of the others."""
+    """The first of the upper band, of doubles the first to come; nothing depends on the order of the others."""
     receiver = moving_receiver()
     ranges = raw_epoch(receiver)[[0, 0, 1, 1]]
     assert (ranges["gnss_id"] == Gnss.GPS).all()
@@ -166,14 +189,88 @@ def test_of_several_signals_of_a_satellite_one_is_used() -> None:
     assert measured_epoch(ranges[[1, 0]], WEEK, SECONDS, SKY)["status"].tolist() == expected[1::-1]
     both = measured_epoch(ranges, WEEK, SECONDS, SKY, masks=DEFAULT_MASKS._replace(one_per_satellite=False))
     assert both["status"].tolist() == [Status.USABLE] * 3 + [Status.DUPLICATE]
-    # Without its code the first is no better than the second; a weak one leaves the place to the other.
-    ranges["cn0"][0] = 20.0
-    assert measured_epoch(ranges[:2], WEEK, SECONDS, SKY)["status"].tolist() == [Status.LOW_CN0, Status.USABLE]
+    assert gives(both[:3]) == [CODE_VALID | DOPPLER_VALID, DOPPLER_VALID, CODE_VALID | DOPPLER_VALID]
+    # Of the upper band any signal serves.
+    ranges["signal"][1] = SIGNAL_BY_CODE[Gnss.GPS, "1W"]
     locate(ranges, WEEK, SECONDS, SKY)
-    ranges["flags"][2] &= ~CODE_VALID
-    ranges["signal"][3] = SIGNAL_BY_CODE[Gnss.GPS, "2W"]
+    ranges["flags"][0] &= ~CODE_VALID
+    measured = measured_epoch(ranges[:2], WEEK, SECONDS, SKY)
+    assert measured["status"].tolist() == [Status.OTHER_SIGNAL, Status.USABLE]
+    assert gives(measured[1:]) == [CODE_VALID | DOPPLER_VALID]
+
+
+def test_a_satellite_keeps_its_meaning_when_its_upper_band_drops() -> None:
+    """No code of another band takes the place, in tight coupling nor in loose; the Doppler of the satellite stays."""
+    receiver = moving_receiver()
+    ranges = two_bands(receiver)
+    upper = SIGNAL_CARRIER_HZ[ranges["signal"]] > 1.5e9
+    whole = measured_epoch(ranges, WEEK, SECONDS, SKY)
+    assert ((whole["status"] == Status.USABLE) == upper).all()
+    assert (whole["status"][~upper] == Status.OTHER_SIGNAL).all()
+    for k in np.flatnonzero(upper):
+        dropped = ranges.copy()
+        dropped["cn0"][k] = 27.9
+        tight = measured_epoch(dropped, WEEK, SECONDS, SKY)
+        others = upper & (np.arange(len(ranges)) != k)
+        assert tight[others].tobytes() == whole[others].tobytes()
+        used = np.flatnonzero((tight["status"] == Status.USABLE) & ~others)
+        same = (ranges["gnss_id"] == ranges["gnss_id"][k]) & (ranges["sv_id"] == ranges["sv_id"][k]) & ~upper
+        assert used.tolist() == np.flatnonzero(same).tolist()
+        assert gives(tight[used]) == [DOPPLER_VALID] * len(used)
+        # The two bands are transmitted 8 m apart: less than 0.1 mm/s.
+        np.testing.assert_allclose(tight["range_rate"][used], whole["range_rate"][k], atol=1e-4)
+        locate(dropped, WEEK, SECONDS, SKY)
+        assert couplings_agree(one_per_satellite(dropped), tight)
+
+
+def couplings_agree(loose: NDArray[np.void], tight: NDArray[np.void]) -> bool:
+    tight = tight[tight["status"] == Status.USABLE]
+    names = ["gnss_id", "sv_id", "signal", "flags"]
+    return sorted(loose[names].tolist()) == sorted(tight[names].tolist())
+
+
+def located_two_bands() -> NDArray[np.void]:
+    ranges = two_bands(moving_receiver())
+    ranges = ranges[ranges["sv_id"] % 4 == 0]
+    locate(ranges, WEEK, SECONDS, SKY)
+    return ranges
+
+
+LOCATED_TWO_BANDS = located_two_bands()
+
+
+@given(st.data())
+def test_each_satellite_gives_at_most_one_code_and_one_doppler(data: st.DataObject) -> None:
+    """Whatever is weak or missing: a code is of the upper band, a Doppler is there where any signal had one."""
+    ranges = LOCATED_TWO_BANDS.copy()
+    flags = st.sampled_from([0, CODE_VALID, DOPPLER_VALID, CODE_VALID | DOPPLER_VALID])
+    weak = st.sampled_from([20.0, 45.0, math.nan])
+    ranges["flags"] = SATELLITE_KNOWN | np.array(data.draw(st.lists(flags, min_size=len(ranges), max_size=len(ranges))))
+    ranges["cn0"] = data.draw(st.lists(weak, min_size=len(ranges), max_size=len(ranges)))
+    order = data.draw(st.permutations(range(len(ranges))))
+    ranges = ranges[order]
+    tight = measured_epoch(ranges, WEEK, SECONDS, SKY)
+    used = tight[tight["status"] == Status.USABLE]
+    strong = ranges[~(ranges["cn0"] < 28.0)]
+    for flag in (CODE_VALID, DOPPLER_VALID):
+        counts = strong["flags"] & flag != 0
+        if flag == CODE_VALID:
+            counts &= SIGNAL_CARRIER_HZ[strong["signal"]] > 1.5e9
+        expected = {(row["gnss_id"], row["sv_id"]) for row in strong[counts]}
+        found = [(row["gnss_id"], row["sv_id"]) for row in used[used["flags"] & flag != 0]]
+        assert sorted(found) == sorted(expected)
+    assert (SIGNAL_CARRIER_HZ[used["signal"][used["flags"] & CODE_VALID != 0]] > 1.5e9).all()
+    assert couplings_agree(one_per_satellite(ranges), tight)
+
+
+def test_a_receiver_without_the_upper_band_gives_doppler_only() -> None:
+    """And where it has none the reason is named."""
+    ranges = two_bands(moving_receiver())
+    ranges = ranges[SIGNAL_CARRIER_HZ[ranges["signal"]] < 1.5e9]
+    ranges["doppler"][0] = math.nan
     measured = measured_epoch(ranges, WEEK, SECONDS, SKY)
-    assert measured["status"].tolist()[2:] == [Status.OTHER_SIGNAL, Status.USABLE]
+    assert measured["status"].tolist() == [Status.OTHER_BAND] + [Status.USABLE] * (len(ranges) - 1)
+    assert gives(measured[1:]) == [DOPPLER_VALID] * (len(ranges) - 1)
 
 
 def test_every_signal_that_is_left_out_has_its_reason() -> None:

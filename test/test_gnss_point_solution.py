@@ -21,6 +21,7 @@ from eskf_ros.gnss.ephemeris import Ephemerides
 from eskf_ros.gnss.point_solution import DEFAULT_SETTINGS, PointSettings, PointSolution, SolutionStatus, solve
 from eskf_ros.gnss.range_model import NO_KLOBUCHAR, PREDICTION, predict
 from eskf_ros.gnss.ranges import (
+    CODE_VALID,
     RANGE,
     TROPOSPHERE_APPLIED,
     Status,
@@ -228,6 +229,24 @@ def test_a_start_near_the_place_changes_nothing() -> None:
     warm = solve(ranges, WEEK, SECONDS, KLOBUCHAR, initial=receiver.position + 30.0)
     np.testing.assert_allclose(warm.position_ecef, cold.position_ecef, atol=1e-3)
     np.testing.assert_array_equal(warm.ranges["status"], cold.ranges["status"])
+
+
+def test_satellites_without_code_serve_the_velocity() -> None:
+    """The position is the one without them, though a whole constellation is among them."""
+    receiver = receiver_at(*PLACES[0], clock_bias=77.0)
+    ranges = measure(receiver, SKY, EVERYWHERE, np.random.default_rng(8))
+    without = (ranges["sv_id"] % 3 == 0) | (ranges["gnss_id"] == Gnss.GLONASS)
+    ranges["flags"][without] &= ~CODE_VALID
+    ranges["pseudorange"][without] = math.nan
+    solution = solve(ranges, WEEK, SECONDS, KLOBUCHAR)
+    alone = solve(ranges[~without], WEEK, SECONDS, KLOBUCHAR)
+    np.testing.assert_allclose(solution.position_ecef, alone.position_ecef, atol=1e-6)
+    np.testing.assert_allclose(solution.covariance_ecef, alone.covariance_ecef, rtol=1e-6)
+    assert solution.used == alone.used
+    assert solution.velocity_used == len(ranges) > alone.velocity_used
+    assert np.trace(solution.velocity_covariance_ecef) < np.trace(alone.velocity_covariance_ecef)
+    ranges["flags"] &= ~CODE_VALID
+    assert solve(ranges, WEEK, SECONDS, KLOBUCHAR).status == SolutionStatus.TOO_FEW
 
 
 class StaticReceiver:

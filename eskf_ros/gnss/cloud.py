@@ -163,7 +163,6 @@ def read_epoch(found: NDArray[Any]) -> Epoch:
     require(found, REQUIRED)
     left_out = max(0, len(found) - MAX_SIGNALS)
     found = found[:MAX_SIGNALS]
-    there = found.dtype.names or ()
     ranges = allocate_ranges(len(found))
     ranges["gnss_id"], ranges["sv_id"] = whole_column(found, "gnss_id", -1), whole_column(found, "sv_id", -1)
     for name in ("carrier_hz", "pseudorange", "pseudorange_std", "doppler", "doppler_std", "cn0"):
@@ -182,9 +181,6 @@ def read_epoch(found: NDArray[Any]) -> Epoch:
         (SATELLITE_KNOWN, np.isfinite(ranges["satellite"]).all(axis=1)),
     ):
         flags[~measured] &= ~bit
-    if "flags" not in there and "sat_clk" not in there:
-        # A position alone is no satellite state: without its clock a range is 100 km off.
-        flags &= ~SATELLITE_KNOWN
     flags[flags & SATELLITE_KNOWN == 0] &= ~ALREADY_TURNED
     ranges["flags"] = flags
     week, seconds, of_epoch = _time_tag(whole_column(found, "gps_week", -1), number_column(found, "gps_tow"))

@@ -243,7 +243,7 @@ def glonass_record(sv_id: int, tb_utc: Instant, leap: int, fields: Fields) -> np
     for name, axes in (("position", "xyz"), ("velocity", ("vx", "vy", "vz")), ("acceleration", ("ax", "ay", "az"))):
         record[name] = [1e3 * fields.get(axis, math.nan) for axis in axes]
     record["group_delay"] = group_delays(Gnss.GLONASS, Message.FDMA, fields)
-    ill = _integer(fields.get("health", math.nan), 0) != 0 or _integer(fields.get("flags", math.nan), 0) & 4
+    ill = _integer(fields.get("health", math.nan), 0) != 0 or _integer(_broadcast(fields, "flags"), 0) & 4
     record["unhealthy"] = ALL_SLOTS if ill else 0
     return record
 
@@ -322,6 +322,7 @@ class Ephemerides:
         self.records = np.zeros(0, EPHEMERIS)
         self.first = np.zeros(GNSS_COUNT * SATELLITE_KEYS + 1, np.int64)
         self.refused: Counter[Fault] = Counter()
+        self._known: set[bytes] = set()
         if records is not None:
             self.add(records)
 
@@ -333,9 +334,40 @@ class Ephemerides:
         faults = check(records)
         for fault in (Fault.NON_FINITE, Fault.BAD_VALUE):
             self.refused[fault] += int(np.count_nonzero(faults == fault))
-        self.records, duplicates = _sorted_once(np.concatenate([self.records, records[faults == Fault.NONE]]))
+        sound = records[faults == Fault.NONE]
+        if self._known.issuperset(_payloads(sound).tolist()):
+            # A receiver repeats what it knows: nothing to sort.
+            self.refused[Fault.DUPLICATE] += len(sound)
+            return
+        sorted_once, duplicates = _sorted_once(np.concatenate([self.records, sound]))
         self.refused[Fault.DUPLICATE] += duplicates
-        keys = SATELLITE_KEYS * self.records["gnss_id"].astype(np.int64) + self.records["sv_id"]
+        self._hold(sorted_once)
+
+    def unknown(self, records: NDArray[np.void]) -> NDArray[np.void]:
+        """Return those of the records that have no `Fault` and are not here yet, byte for byte."""
+        fresh = records[[payload not in self._known for payload in _payloads(records).tolist()]]
+        return fresh[check(fresh) == Fault.NONE]
+
+    def drop_ended(self, week: int, seconds: float) -> None:
+        """Forget records whose time (``toe`` and ``max_age``) ended before an instant of GPS time.
+
+        The last one of each message of a satellite stays: it tells a satellite whose ephemerides are old from one that
+        has never had any.
+        """
+        records = self.records
+        since_toe = (week - records["toe_week"]) * SECONDS_PER_WEEK + (seconds - records["toe"])
+        identity = [records[name] for name in ("gnss_id", "sv_id", "message")]
+        last = np.ones(len(records), np.bool_)
+        last[:-1] = np.any([key[1:] != key[:-1] for key in identity], axis=0)
+        kept = last | ~(since_toe > records["max_age"])
+        if not kept.all():
+            self._hold(records[kept])
+
+    def _hold(self, records: NDArray[np.void]) -> None:
+        """Take records in their order as all there are."""
+        self.records = records
+        self._known = set(_payloads(records).tolist())
+        keys = SATELLITE_KEYS * records["gnss_id"].astype(np.int64) + records["sv_id"]
         self.first = np.searchsorted(keys, np.arange(GNSS_COUNT * SATELLITE_KEYS + 1))
 
     def of(self, gnss_id: int, sv_id: int) -> NDArray[np.void]:
@@ -368,10 +400,15 @@ def check(records: NDArray[np.void]) -> NDArray[np.int64]:
     return np.where(finite, np.where(possible, Fault.NONE, Fault.BAD_VALUE), Fault.NON_FINITE).astype(np.int64)
 
 
+def _payloads(records: NDArray[np.void]) -> NDArray[np.bytes_]:
+    """Return the bytes of each record, to be compared: zeros at their end do not count, which none is shorter by."""
+    return np.ascontiguousarray(records).view(f"S{EPHEMERIS.itemsize}")
+
+
 def _sorted_once(records: NDArray[np.void]) -> tuple[NDArray[np.void], int]:
     """Return the records in their order, of each issue the one sent last, and how many were left out."""
     sent = records["sent_week"] * SECONDS_PER_WEEK + np.nan_to_num(records["sent"], nan=-np.inf)
-    payload = np.array([record.tobytes() for record in records], f"S{EPHEMERIS.itemsize}")
+    payload = _payloads(records)
     identity = [records[name] for name in ("gnss_id", "sv_id", "message", "toe_week", "toe", "issue")]
     order = np.lexsort([payload, sent, *reversed(identity)])
     last = np.ones(len(records), np.bool_)

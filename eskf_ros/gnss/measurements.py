@@ -25,7 +25,16 @@ from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
 from eskf_ros.gnss.ephemeris import Ephemerides
 from eskf_ros.gnss.geometry import distance, turned, turned_at_arrival
 from eskf_ros.gnss.range_model import NO_KLOBUCHAR, PREDICTION, sight
-from eskf_ros.gnss.ranges import ALREADY_TURNED, CODE_VALID, DOPPLER_VALID, Status, locate_one
+from eskf_ros.gnss.ranges import (
+    ALREADY_TURNED,
+    CODE_VALID,
+    DEFAULT_CN0_MASK,
+    DOPPLER_VALID,
+    Status,
+    choose_per_satellite,
+    leave_out_weak,
+    locate_one,
+)
 from eskf_ros.gnss.signals import GNSS_COUNT, SPEED_OF_LIGHT, time_group
 from eskf_ros.gnss.weighting import DEFAULT_WEIGHTING, Weighting
 
@@ -74,12 +83,12 @@ UNKNOWN_POSITION = (math.nan, math.nan, math.nan)
 class Masks(NamedTuple):
     """Which signals are left out: elevation below (rad), C/N0 below (dB-Hz; unknown passes).
 
-    ``one_per_satellite``: of several signals of a satellite only the first in `signals.SIGNALS`. They share the errors
-    of orbit, clock and atmosphere; taken as independent they are believed too much.
+    ``one_per_satellite``: of several signals of a satellite one code and one Doppler, see
+    `ranges.choose_per_satellite`.
     """
 
     elevation: float = math.radians(10.0)
-    cn0: float = 28.0
+    cn0: float = DEFAULT_CN0_MASK
     one_per_satellite: bool = True
 
 
@@ -88,10 +97,7 @@ DEFAULT_MASKS = Masks()
 _USABLE = int(Status.USABLE)
 _BAD_VALUE = int(Status.BAD_VALUE)
 _NOT_LOCATED = int(Status.NOT_LOCATED)
-_DUPLICATE = int(Status.DUPLICATE)
-_OTHER_SIGNAL = int(Status.OTHER_SIGNAL)
 _LOW_ELEVATION = int(Status.LOW_ELEVATION)
-_LOW_CN0 = int(Status.LOW_CN0)
 
 
 def measured_epoch(
@@ -218,44 +224,15 @@ def turn(signal, receiver):
 
 @njit
 def choose_signals(measured, masks):
-    """Set the status of duplicates, of further signals of a satellite, and of what the masks leave out.
+    """Set the status of what the masks or `ranges.choose_per_satellite` leave out; return how many signals remain.
 
-    Returns how many are left. Of equal signals the first counts; of several of a satellite the first in
-    `signals.SIGNALS`, among those with code if there are any. The elevation mask holds where elevations are known.
+    The elevation mask holds where elevations are known.
     """
-    usable = 0
+    leave_out_weak(measured, masks.cn0)
     for k in range(len(measured)):
-        signal = measured[k]
-        if signal["status"] != _USABLE:
-            continue
-        if signal["cn0"] < masks.cn0:
-            signal["status"] = _LOW_CN0
-        elif signal["elevation"] < masks.elevation:
-            signal["status"] = _LOW_ELEVATION
-    for k in range(len(measured)):
-        signal = measured[k]
-        if signal["status"] != _USABLE:
-            continue
-        for other in range(len(measured)):
-            rival = measured[other]
-            if other == k or rival["gnss_id"] != signal["gnss_id"] or rival["sv_id"] != signal["sv_id"]:
-                continue
-            same = rival["signal"] == signal["signal"] and not abs(rival["carrier_hz"] - signal["carrier_hz"]) > 1.0
-            if same and other < k and rival["status"] in (_USABLE, _OTHER_SIGNAL):
-                signal["status"] = _DUPLICATE
-                break
-            if masks.one_per_satellite and not same and rival["status"] == _USABLE and precedes(rival, signal):
-                signal["status"] = _OTHER_SIGNAL
-        if signal["status"] == _USABLE:
-            usable += 1
-    return usable
-
-
-@njit
-def precedes(first, second):
-    """True when of two signals of a satellite the first is the one to use."""
-    first_code, second_code = first["flags"] & CODE_VALID, second["flags"] & CODE_VALID
-    return first_code > second_code or (first_code == second_code and first["signal"] < second["signal"])
+        if measured[k]["status"] == _USABLE and measured[k]["elevation"] < masks.elevation:
+            measured[k]["status"] = _LOW_ELEVATION
+    return choose_per_satellite(measured, masks.one_per_satellite)
 
 
 @njit

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from eskf_ros.earth import SEMI_MAJOR_AXIS, east_north_up_to_ecef, ecef_to_geodetic
 from eskf_ros.gnss.range_model import NO_KLOBUCHAR, PREDICTION, predict
-from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, Status
+from eskf_ros.gnss.ranges import CODE_VALID, DEFAULT_CN0_MASK, DOPPLER_VALID, Status
 from eskf_ros.gnss.signals import GNSS_COUNT, Gnss, time_group
 from eskf_ros.gnss.weighting import DEFAULT_WEIGHTING, Weighting
 
@@ -44,7 +44,7 @@ class PointSettings(NamedTuple):
     """
 
     elevation_mask: float = math.radians(10.0)
-    cn0_mask: float = 28.0
+    cn0_mask: float = DEFAULT_CN0_MASK
     huber: float = 1.5
     exclusion: float = 4.0
     system_offset_std: float = 10.0
@@ -138,13 +138,16 @@ def solve(
 ) -> PointSolution:
     """Return position, velocity and clock from located ranges (RANGE) of one epoch, one per satellite.
 
+    Code and Doppler of a satellite may be two ranges, each with the flag of what it gives, as `one_per_satellite`
+    leaves them; those without code serve the velocity alone.
+
     ``week``, ``seconds``: GPS time of the epoch, to a minute. ``klobuchar``: eight parameters, None if unknown: then
     the ionosphere stays in the ranges that are not corrected for it, and in their standard deviation. ``initial``:
     ECEF (m) to start from; not needed. Never raises for bad ranges: they have a status, and so has the solution.
     """
     solution = _blank(ranges)
-    usable = (ranges["status"] == Status.USABLE) & (ranges["flags"] & CODE_VALID != 0)
-    if np.count_nonzero(usable) < FEWEST:
+    usable = (ranges["status"] == Status.USABLE) & (ranges["flags"] & (CODE_VALID | DOPPLER_VALID) != 0)
+    if np.count_nonzero(usable & (ranges["flags"] & CODE_VALID != 0)) < FEWEST:
         return solution
     ionosphere = NO_KLOBUCHAR if klobuchar is None else np.asarray(klobuchar, np.float64)
     epoch = _Epoch(ranges[usable], solution.predictions[usable], week, seconds, ionosphere, settings)
@@ -211,13 +214,14 @@ def _solve_position(epoch: _Epoch, initial: Array | None, solution: PointSolutio
     """Solve position and clock; write them and the status of each range to ``solution``."""
     ranges, predictions, settings = epoch.ranges, epoch.predictions, epoch.settings
     groups = np.array([time_group(*satellite) for satellite in ranges[["gnss_id", "sv_id"]].tolist()])
+    coded = ranges["flags"] & CODE_VALID != 0
     # In the order of `Gnss`, which begins with GPS.
-    reference, *others = np.unique(groups).tolist()
+    reference, *others = np.unique(groups[coded]).tolist()
     prior_std = np.full(4 + len(others), math.inf)
     for column, group in enumerate(others, start=4):
         prior_std[column] = settings.glonass_offset_std if group == Gnss.GLONASS else settings.system_offset_std
     unknowns = np.zeros(4 + len(others))
-    unknowns[:3] = _below(ranges["satellite"]) if initial is None else initial
+    unknowns[:3] = _below(ranges["satellite"][coded]) if initial is None else initial
 
     weights = np.ones(len(ranges))
     faulty = np.zeros(len(ranges), np.bool_)
@@ -230,7 +234,7 @@ def _solve_position(epoch: _Epoch, initial: Array | None, solution: PointSolutio
         if near:
             low = predictions["elevation"] < settings.elevation_mask
             weak = ranges["cn0"] < settings.cn0_mask
-        rows = ~(faulty | low | weak)
+        rows = coded & ~(faulty | low | weak)
         if np.count_nonzero(rows) < FEWEST:
             solution.status = SolutionStatus.TOO_FEW
             return

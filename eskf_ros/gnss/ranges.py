@@ -17,8 +17,8 @@ from eskf_ros.compiled import njit
 from eskf_ros.gnss.ephemeris import NO_ISSUE, SATELLITE_KEYS, Ephemerides
 from eskf_ros.gnss.orbits import satellite_state, transmission
 from eskf_ros.gnss.signals import (
-    BEIDOU_3,
     GNSS_COUNT,
+    IS_CONSTELLATION,
     L1,
     SIGNAL_CARRIER_HZ,
     SIGNAL_GNSS,
@@ -28,6 +28,7 @@ from eskf_ros.gnss.signals import (
     UNKNOWN_SIGNAL,
     Gnss,
     carrier_hz,
+    is_upper_band,
 )
 from eskf_ros.gnss.time import SECONDS_PER_WEEK, elapsed
 
@@ -38,6 +39,7 @@ class Status(IntEnum):
     ``NOT_LOCATED``: no one has looked yet. ``DUPLICATE``: the satellite and signal came before in the same epoch.
     ``OTHER_SIGNAL``: another signal of the satellite is used. ``WRONG_TIME``: its time tag is not that of its epoch.
     ``WRONG_WEEK``: an ephemeris would fit if the week were another. ``TOO_MANY``: beyond the most signals of an epoch.
+    ``OTHER_BAND``: a code of another band than L1 without Doppler, and nothing else of the satellite is used.
     """
 
     USABLE = 0
@@ -57,6 +59,7 @@ class Status(IntEnum):
     WRONG_TIME = 14
     WRONG_WEEK = 15
     TOO_MANY = 16
+    OTHER_BAND = 17
 
 
 CODE_VALID = 1
@@ -113,6 +116,9 @@ LOWEST_CARRIER_HZ = 1.1e9
 HIGHEST_CARRIER_HZ = 1.7e9
 HIGHEST_CN0 = 100.0
 
+DEFAULT_CN0_MASK = 28.0
+"""dB-Hz: below it a signal is hardly tracked."""
+
 _UNKNOWN_SIGNAL = int(Status.UNKNOWN_SIGNAL)
 _BAD_VALUE = int(Status.BAD_VALUE)
 _NO_EPHEMERIS = int(Status.NO_EPHEMERIS)
@@ -122,6 +128,10 @@ _NO_GROUP_DELAY = int(Status.NO_GROUP_DELAY)
 _BAD_EPHEMERIS = int(Status.BAD_EPHEMERIS)
 _USABLE = int(Status.USABLE)
 _WRONG_WEEK = int(Status.WRONG_WEEK)
+_LOW_CN0 = int(Status.LOW_CN0)
+_DUPLICATE = int(Status.DUPLICATE)
+_OTHER_SIGNAL = int(Status.OTHER_SIGNAL)
+_OTHER_BAND = int(Status.OTHER_BAND)
 _GLONASS = int(Gnss.GLONASS)
 _SIGNAL_COUNT = len(SIGNALS)
 
@@ -162,16 +172,17 @@ def status_counts(ranges: NDArray[np.void]) -> Counter[Status]:
     return Counter({Status(value): int(count) for value, count in zip(values, counts)})
 
 
-def one_per_satellite(ranges: NDArray[np.void]) -> NDArray[np.void]:
-    """Return of each satellite the usable range whose signal comes first in `signals.SIGNALS`: L1 where there is one.
+def one_per_satellite(ranges: NDArray[np.void], cn0_mask: float = DEFAULT_CN0_MASK) -> NDArray[np.void]:
+    """Return of each satellite one code and one Doppler, as `choose_per_satellite` says, in the order of satellites.
 
-    Several signals of a satellite share its orbit, clock and ionosphere errors; a filter that takes all of them as
-    independent believes too much.
+    They are one range where the same signal gives both, else two, each with the flag of what it gives. Signals with a
+    C/N0 below ``cn0_mask`` (dB-Hz) are left out before, as in tight coupling.
     """
-    usable = ranges[(ranges["status"] == Status.USABLE) & (ranges["flags"] & CODE_VALID != 0)]
-    usable = usable[np.lexsort([usable["signal"], usable["sv_id"], usable["gnss_id"]])]
-    satellite = SATELLITE_KEYS * usable["gnss_id"] + usable["sv_id"]
-    return usable[np.concatenate([[True], satellite[1:] != satellite[:-1]]) if len(usable) else []]
+    chosen = ranges.copy()
+    leave_out_weak(chosen, cn0_mask)
+    choose_per_satellite(chosen, True)
+    chosen = chosen[chosen["status"] == Status.USABLE]
+    return chosen[np.lexsort([chosen["signal"], chosen["sv_id"], chosen["gnss_id"]])]
 
 
 def ionosphere_free(ranges: NDArray[np.void]) -> NDArray[np.void]:
@@ -204,6 +215,108 @@ def ionosphere_free(ranges: NDArray[np.void]) -> NDArray[np.void]:
 
 
 @njit
+def leave_out_weak(signals, cn0_mask):
+    """Set the status of usable signals (RANGE, MEASURED_SIGNAL) with a C/N0 below the mask; an unknown one passes."""
+    for k in range(len(signals)):
+        if signals[k]["status"] == _USABLE and signals[k]["cn0"] < cn0_mask:
+            signals[k]["status"] = _LOW_CN0
+
+
+@njit
+def choose_per_satellite(signals, one_of_each):
+    """Leave of each satellite's usable signals (RANGE, MEASURED_SIGNAL) what may be used; return how many are left.
+
+    Code is taken of the upper band only (`signals.is_upper_band`): the receiver delays other bands differently, and its
+    clock would take the difference for the satellite's. With ``one_of_each`` a satellite gives one code, of the signal
+    that comes first in `signals.SIGNALS`, and one Doppler, of the same signal if it has one, else of the first of any
+    band: several share the errors of orbit, clock and atmosphere; taken as independent they are believed too much.
+    The flags say what a signal is left to give. Of equal signals the first to come counts.
+    """
+    for k in range(len(signals)):
+        if signals[k]["status"] == _USABLE and is_double(signals, k):
+            signals[k]["status"] = _DUPLICATE
+    given = np.zeros(len(signals), np.int64)
+    unused = np.full(len(signals), _OTHER_SIGNAL)
+    for k in range(len(signals)):
+        if signals[k]["status"] != _USABLE:
+            continue
+        code, doppler = first_of_satellite(signals, k, CODE_VALID), first_of_satellite(signals, k, DOPPLER_VALID)
+        if code >= 0 and gives(signals[code], DOPPLER_VALID):
+            doppler = code
+        for flag, chosen in ((CODE_VALID, code), (DOPPLER_VALID, doppler)):
+            if k == chosen or (not one_of_each and gives(signals[k], flag)):
+                given[k] |= flag
+        if code < 0 and doppler < 0:
+            unused[k] = _OTHER_BAND
+    count = 0
+    for k in range(len(signals)):
+        if signals[k]["status"] != _USABLE:
+            continue
+        if given[k]:
+            signals[k]["flags"] &= ~(CODE_VALID | DOPPLER_VALID) | given[k]
+            count += 1
+        else:
+            signals[k]["status"] = unused[k]
+    return count
+
+
+@njit
+def is_double(signals, k):
+    """True when an earlier usable signal is of the same satellite and the same kind."""
+    signal = signals[k]
+    for earlier in range(k):
+        other = signals[earlier]
+        if (
+            other["status"] == _USABLE
+            and of_one_satellite(other, signal)
+            and other["signal"] == signal["signal"]
+            and not abs(other["carrier_hz"] - signal["carrier_hz"]) > 1.0
+        ):
+            return True
+    return False
+
+
+@njit
+def of_one_satellite(first, second):
+    """True when two signals are of the same satellite."""
+    return first["gnss_id"] == second["gnss_id"] and first["sv_id"] == second["sv_id"]
+
+
+@njit
+def gives(signal, flag):
+    """True when a signal has a code (`CODE_VALID`) of the band that is used, or a Doppler (`DOPPLER_VALID`) in m/s."""
+    if not signal["flags"] & flag:
+        return False
+    if flag == CODE_VALID:
+        return is_upper_band(signal["signal"], signal["carrier_hz"])
+    return not math.isnan(signal["carrier_hz"])
+
+
+@njit
+def first_of_satellite(signals, k, flag):
+    """Return which usable signal of the satellite of ``signals[k]`` comes first among those that give it, -1 for none.
+
+    First in `signals.SIGNALS`; of signals that are not listed the one with the higher carrier.
+    """
+    first = -1
+    for other in range(len(signals)):
+        rival = signals[other]
+        if rival["status"] != _USABLE or not of_one_satellite(rival, signals[k]) or not gives(rival, flag):
+            continue
+        if first < 0 or precedes(rival, signals[first]):
+            first = other
+    return first
+
+
+@njit
+def precedes(first, second):
+    """True when of two different signals of a satellite the first is the one to use."""
+    if first["signal"] != second["signal"]:
+        return first["signal"] < second["signal"]
+    return first["carrier_hz"] > second["carrier_hz"]
+
+
+@njit
 def locate_all(ranges, week, seconds, records, first):
     """`locate` for the arrays of an `Ephemerides`."""
     for k in range(len(ranges)):
@@ -231,11 +344,16 @@ def locate_one(observed, week, seconds, records, first):
         observed["carrier_hz"] = SIGNAL_CARRIER_HZ[signal] if known_signal and gnss != _GLONASS else math.nan
     if observed["flags"] & CLOCK_APPLIED:
         observed["satellite_clock"] = 0.0
-    if not 0 <= gnss < GNSS_COUNT or gnss == BEIDOU_3:
-        # It is an index into tables of constellations.
+    if not 0 <= gnss < GNSS_COUNT or not IS_CONSTELLATION[gnss]:
+        # It is an index into tables of constellations; a satellite of no system here has a time of its own.
         observed["status"] = _UNKNOWN_SIGNAL
         return
+    if math.isnan(observed["satellite_clock"]):
+        # A position alone is no satellite state: without its clock a range is 100 km off. The ephemerides have both.
+        observed["flags"] &= ~(SATELLITE_KNOWN | ALREADY_TURNED)
     if observed["flags"] & SATELLITE_KNOWN:
+        if math.isnan(observed["satellite_clock_drift"]):
+            observed["satellite_clock_drift"] = 0.0
         velocity = observed["satellite_velocity"]
         if math.isnan(velocity[0] + velocity[1] + velocity[2]):
             observed["flags"] &= ~DOPPLER_VALID
@@ -300,13 +418,14 @@ def choose(records, first, gnss_id, sv_id, slot, week, seconds, issue):
 
     Of the messages in their time (``max_lead``, ``max_age``) that give the group delay of ``slot``: the one first in
     `ephemeris.Message`, and of its issues the one whose reference time is closest, as a share of the time allowed; with
-    ``issue`` (not `NO_ISSUE`) only that issue. The satellite is unhealthy when this ephemeris says so, or the one sent
-    last before the instant: an old good one is no way around a new warning.
+    ``issue`` (not `NO_ISSUE`) only that issue. What was sent only after the instant serves where nothing else does. The
+    satellite is unhealthy when this ephemeris says so, or the one sent last before the instant: an old good one is no
+    way around a new warning.
     """
     if not (0 <= gnss_id < GNSS_COUNT and 0 <= sv_id < SATELLITE_KEYS):
         return -1, _NO_EPHEMERIS
     key = SATELLITE_KEYS * gnss_id + sv_id
-    chosen, message, closest = -1, 0, math.inf
+    chosen, message, closest, ahead = -1, 0, math.inf, False
     newest, warned = -math.inf, False
     reason = _NO_EPHEMERIS
     for k in range(first[key], first[key + 1]):
@@ -321,14 +440,18 @@ def choose(records, first, gnss_id, sv_id, slot, week, seconds, issue):
         if slot < 0 or math.isnan(ephemeris["group_delay"][slot]):
             reason = max(reason, _NO_GROUP_DELAY)
             continue
-        if chosen >= 0 and ephemeris["message"] > message:
+        # NaN where it is not known: what the receiver has, has been sent.
+        until_sent = elapsed(ephemeris["sent_week"], ephemeris["sent"], week, seconds)
+        unsent = until_sent > 0.0
+        later_message = chosen >= 0 and ephemeris["message"] > message
+        if later_message and not ahead:
             break
-        since_sent = elapsed(ephemeris["sent_week"], ephemeris["sent"], week, seconds)
-        if newest < since_sent <= 0.0:
-            newest = since_sent
+        if newest < until_sent <= 0.0:
+            newest = until_sent
             warned = (ephemeris["unhealthy"] >> slot) & 1 != 0
-        if age <= closest:
-            chosen, message, closest = k, ephemeris["message"], age
+        replaces = age <= closest and not later_message
+        if chosen < 0 or (ahead and not unsent) or (ahead == unsent and replaces):
+            chosen, message, closest, ahead = k, ephemeris["message"], age, unsent
     if chosen < 0:
         return -1, reason
     if warned or (records[chosen]["unhealthy"] >> slot) & 1:

@@ -44,6 +44,9 @@ class Gnss(IntEnum):
 GNSS_COUNT = 8
 """Length of a table indexed by ``gnss_id`` or `time_group`."""
 
+IS_CONSTELLATION = np.isin(np.arange(GNSS_COUNT), list(Gnss))
+"""By ``gnss_id``: whether it is one of `Gnss`."""
+
 BEIDOU_3 = 4
 """`time_group` of the satellites of BeiDou-3 (a ``gnss_id`` that no constellation has)."""
 
@@ -56,6 +59,9 @@ LETTERS = {
     "R": Gnss.GLONASS,
 }
 """Constellation by the letter RINEX gives it."""
+
+LOWEST_UPPER_BAND_HZ = 1.5e9
+"""L1, E1, B1 and G1 are above, all other carriers below."""
 
 SLOT_COUNT = 8
 NO_SLOT = -1
@@ -170,6 +176,18 @@ def carrier_hz(signal, channel):
     GLONASS ICD L1, L2, edition 5.1, section 3.3.1.1.
     """
     return SIGNAL_CARRIER_HZ[signal] + channel * _CHANNEL_STEP_HZ[signal]
+
+
+@njit
+def is_upper_band(signal, carrier):
+    """True for a signal around L1: neither ``SIGNALS[signal]`` nor its carrier (Hz, NaN unknown) is of another band.
+
+    Receivers delay the bands differently, by metres: a pseudorange of another band has another receiver clock in it.
+    """
+    listed = 0 <= signal < len(SIGNAL_CARRIER_HZ)
+    if listed and SIGNAL_CARRIER_HZ[signal] < LOWEST_UPPER_BAND_HZ:
+        return False
+    return not carrier < LOWEST_UPPER_BAND_HZ
 
 
 @njit

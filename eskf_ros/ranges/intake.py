@@ -33,6 +33,7 @@ from eskf_ros.gnss.ranges import (
     status_counts,
 )
 from eskf_ros.gnss.signals import Gnss
+from eskf_ros.gnss.time import Instant
 from eskf_ros.parameters import Parameters
 
 HORIZON = math.radians(-90.0)
@@ -157,7 +158,7 @@ class RangeIntake:
         left_out = {"ranges: signals beyond the first 200 of an epoch": epoch.left_out}
         self._note_message(left_out if epoch.left_out else {})
         self.epochs += 1
-        ephemerides, klobuchar = self._serving(stamp + self._time_offset)
+        ephemerides, klobuchar = self._serving(stamp + self._time_offset, (epoch.week, epoch.seconds))
         if self._solves:
             solution = self._solution(epoch, ephemerides, klobuchar)
             statuses = status_counts(epoch.ranges)
@@ -171,9 +172,9 @@ class RangeIntake:
         self._navigator.push_ranges(stamp, instant, signals, klobuchar, arrival)
         return self._solution(epoch, ephemerides, klobuchar) if self.wants_solution else None
 
-    def _serving(self, stamp: int) -> tuple[Ephemerides, NDArray[np.float64]]:
-        """Return the ephemerides and the parameters of the ionosphere for an epoch with this stamp (ns)."""
-        ephemerides, klobuchar = self._ephemerides.at(stamp)
+    def _serving(self, stamp: int, instant: Instant) -> tuple[Ephemerides, NDArray[np.float64]]:
+        """Return ephemerides and parameters of the ionosphere for an epoch with this stamp (ns) and GPS time."""
+        ephemerides, klobuchar = self._ephemerides.at(stamp, instant)
         _, stand_in = self._ionosphere_stand_in.at(stamp)
         return ephemerides, stand_in if np.isnan(klobuchar).any() else klobuchar
 
