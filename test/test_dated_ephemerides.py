@@ -72,7 +72,7 @@ def test_what_is_settled_stays_and_is_not_kept_twice() -> None:
 
 def test_what_is_sent_again_is_not_kept() -> None:
     kept = DatedEphemerides(RECORDS[:1], KLOBUCHAR, WINDOW)
-    for k in range(9):
+    for k in range(11):
         kept.add(START + k * SECOND, RECORDS[:3], None)
         found, _ = kept.at(START + k * SECOND)
     assert len(found) == 3

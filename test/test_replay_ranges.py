@@ -218,3 +218,17 @@ def test_every_signal_has_its_row(folder: Path) -> None:
     sources = {line.split(",")[-1] for line in lines}
     assert {source[0] for source in sources} == set("GEC")
     assert {source[3:] for source in sources if source[0] == "G"} == {" 1C"}
+
+
+@pytest.mark.parametrize("mode", ["tight", "loose"])
+def test_a_magnetometer_beside_ranges_is_fused(tmp_path: Path, mode: str) -> None:
+    """Where no fix tells the Earth's magnetic field, the epochs of the ranges do."""
+    bag = tmp_path / "mag.mcap"
+    sensors = ("--sensor", "ranges", "--sensor", "magnetometer")
+    part = ("--set", "start=12", "--set", "stop=32", "--set", "imu_rate=50")
+    assert simulate_main(["drive", "--seed", "4", *part, *sensors, "--quiet", "--out", str(bag)]) == 0
+    lines = ("ranges.use_point_solution: true", "mag.use: true", "mag.declination_deg: 4.0", "mag.error_std_deg: 10.0")
+    result = replay(bag, "--mode", mode, config=with_parameters(tmp_path, *lines))
+    # The rest comes before level, position and field are known.
+    assert result["aids"]["mag"]["fused"] > 0.5 * result["aids"]["mag"]["offered"] > 100
+    assert result["final"]["status"] == "GOOD"

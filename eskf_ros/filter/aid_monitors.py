@@ -322,12 +322,13 @@ def _fault_complaints(state: np.void, settings: np.void, source: int) -> list[st
     # A large fault leaves something of itself in the estimates of the others.
     certain = significance > max(FAULT_SIGMAS, 0.3 * significance.max())
     group = "gnss" if source == 0 else "second_gnss"
+    clock = "ranges" if source == 0 and settings["solves_ranges"] else group
     found = []
     if certain[TIME] and abs(estimate[TIME]) > TIME_ERROR:
         right = float(settings["gnss_time_offset"][source]) + estimate[TIME]
         found.append(
             f"the fixes{_of(source)} are stamped {abs(estimate[TIME]):.3f} s (+- {sigma[TIME]:.3f}) "
-            f"{'late' if estimate[TIME] < 0.0 else 'early'}: set {group}.time_offset to {right:.3f}, or synchronise "
+            f"{'late' if estimate[TIME] < 0.0 else 'early'}: set {clock}.time_offset to {right:.3f}, or synchronise "
             "the clocks"
         )
     arm = estimate[:TIME] * certain[:TIME]

@@ -454,6 +454,7 @@ SETTINGS = np.dtype(
         ("imu_position_base", "f8", (3,)),
         ("lever_arms_body", "f8", (SOURCES, 3)),
         ("gnss_time_offset", "f8", (SOURCES,)),
+        ("solves_ranges", "i8"),
         ("heading_lines_body", "f8", (SOURCES, 3)),
         ("baro_arm_body", "f8", (3,)),
         ("mag_to_imu", "f8", (3, 3)),

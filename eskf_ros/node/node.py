@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Callable
 from functools import partial
@@ -121,6 +122,9 @@ class EskfNode(Node):
         self.create_timer(REPORT_PERIOD, self._contained(self._report, "report"), clock=steady)
         for name in unused_overrides(self):
             self.get_logger().warn(f"parameter {name} belongs to nothing here and has no effect")
+        # What was made so far stays: looking through it for garbage would take longer than the IMU waits.
+        gc.collect()
+        gc.freeze()
         self.get_logger().info("ready: listening to " + ", ".join(monitor.label for monitor in self.monitors))
 
     @property

@@ -65,6 +65,7 @@ REMEDIES = {
     Status.UNKNOWN_SIGNAL: "the numbers gnss_id and sig_id are those of u-blox",
     Status.BAD_VALUE: "pseudoranges are in m, Doppler in Hz",
     Status.LOW_CN0: "ranges.cn0_mask leaves them out",
+    Status.OTHER_BAND: "pseudoranges are used of the upper band only (L1, E1, B1, G1)",
 }
 
 BLAMED_SHARE = 0.5
@@ -72,6 +73,10 @@ BLAMED_SHARE = 0.5
 
 RECENT = 60
 """Messages that what is wrong at the moment is judged by: a minute of a slow receiver."""
+
+PLACE_INTERVAL = 10 * SECOND
+PLACE_SHARE = 3 * SECOND // 2
+"""In so many ns of so many, by their stamps alone, epochs tell where the Earth's magnetic field is looked up."""
 
 NORMAL = (Status.USABLE, Status.OTHER_SIGNAL)
 
@@ -82,6 +87,14 @@ FAULTS = {
 
 
 Key = TypeVar("Key")
+
+
+def place_of(solution: PointSolution) -> tuple[float, float, float] | None:
+    """Where an epoch was solved: latitude and longitude (deg), altitude (m)."""
+    if solution.status != SolutionStatus.SOLVED:
+        return None
+    latitude, longitude, altitude = solution.geodetic
+    return math.degrees(latitude), math.degrees(longitude), altitude
 
 
 class RangeIntake:
@@ -169,8 +182,14 @@ class RangeIntake:
         instant = (epoch.week, epoch.seconds)
         signals = measured_epoch(epoch.ranges, *instant, ephemerides, masks=self._masks)
         self._recent_statuses.append(status_counts(signals))
-        self._navigator.push_ranges(stamp, instant, signals, klobuchar, arrival)
-        return self._solution(epoch, ephemerides, klobuchar) if self.wants_solution else None
+        wants_place = self._navigator.needs_field and stamp % PLACE_INTERVAL < PLACE_SHARE
+        if not (self.wants_solution or wants_place):
+            self._navigator.push_ranges(stamp, instant, signals, klobuchar, arrival)
+            return None
+        solution = self._solution(epoch, ephemerides, klobuchar)
+        place = place_of(solution) if wants_place else None
+        self._navigator.push_ranges(stamp, instant, signals, klobuchar, arrival, place)
+        return solution if self.wants_solution else None
 
     def _serving(self, stamp: int, instant: Instant) -> tuple[Ephemerides, NDArray[np.float64]]:
         """Return ephemerides and parameters of the ionosphere for an epoch with this stamp (ns) and GPS time."""
@@ -181,7 +200,7 @@ class RangeIntake:
     def _solution(self, epoch: Epoch, ephemerides: Ephemerides, klobuchar: NDArray[np.float64]) -> PointSolution:
         """Solve the epoch alone, as a receiver would; from nothing, so that the order of epochs leaves no trace."""
         locate(epoch.ranges, epoch.week, epoch.seconds, ephemerides)
-        ranges = one_per_satellite(epoch.ranges)
+        ranges = one_per_satellite(epoch.ranges, self._masks.cn0)
         solution = solve(ranges, epoch.week, epoch.seconds, klobuchar, self._point_settings)
         if solution.status == SolutionStatus.SOLVED:
             self.solved += 1
@@ -189,13 +208,11 @@ class RangeIntake:
 
     def _push_solution(self, stamp: int, solution: PointSolution, arrival: int) -> None:
         """Give position and velocity of a point solution to the navigator."""
-        if solution.status == SolutionStatus.SOLVED:
-            latitude, longitude, altitude = solution.geodetic
+        place = place_of(solution)
+        if place is not None:
             self._navigator.push_gnss_position(
                 stamp,
-                math.degrees(latitude),
-                math.degrees(longitude),
-                altitude,
+                *place,
                 solution.covariance_enu.ravel(),
                 COVARIANCE_KNOWN,
                 STATUS_FIX,

@@ -60,13 +60,14 @@ def find_topics(
     """
     names = parameters.topics
     imu = _require(reader, bag, names.imu, (IMU,), "set topics.imu in --config FILE")
+    needed = "ranges" if uses_ranges(parameters) else "gnss_fix"
     inputs = {}
     for kind in inputs_of(parameters):
         name, remedy = getattr(names, kind.name), f"set topics.{kind.name} in --config FILE"
         if kind.name in RANGES and has_range_file:
             inputs[kind] = name
             continue
-        is_required = kind.name in ("gnss_fix", "ranges") or name != getattr(Topics(), kind.name)
+        is_required = kind.name == needed or name != getattr(Topics(), kind.name)
         if is_required or _find(reader, name):
             instead = " (a RINEX file can be given with --ranges FILE.obs)" if kind.name == "ranges" else ""
             topic = _require(reader, bag, name, kind.types, remedy, instead)
