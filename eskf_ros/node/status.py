@@ -13,7 +13,7 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from eskf_ros.filter.aiding.signal import name_of
-from eskf_ros.filter.layout import STREAM_NAMES, Status, Stream, Verdict
+from eskf_ros.filter.layout import SOURCES, STREAM_NAMES, Phase, Status, Stream, Verdict
 from eskf_ros.gnss.signals import BEIDOU_3, Gnss
 from eskf_ros.node.clocks import SECOND, StampMonitor, clock_complaints
 from eskf_ros.node.messages import key_values
@@ -32,6 +32,17 @@ FEWEST_TO_SOLVE = 4
 
 GROUP_NAMES = {**{int(gnss): gnss.name.lower() for gnss in Gnss}, BEIDOU_3: "beidou-3", int(Gnss.BEIDOU): "beidou-2"}
 """What `gnss.signals.time_group` tells apart."""
+
+PHASE_LABELS = {
+    Stream.GNSS_POSITION: "fixes",
+    Stream.GNSS_VELOCITY: "velocities",
+    Stream.PSEUDORANGE: "position by pseudoranges",
+}
+SENSORS = (
+    *((stream, 0) for stream in (Stream.HEADING, Stream.MAG, Stream.WHEEL, Stream.BODY_VELOCITY, Stream.BARO)),
+    *((stream, source) for stream in (Stream.GNSS_POSITION, Stream.GNSS_VELOCITY) for source in range(SOURCES)),
+)
+"""Streams, and for receivers which of them, whose phase is told once something came."""
 
 
 def status_report(node: EskfNode, stamp: Time) -> DiagnosticArray:
@@ -214,12 +225,18 @@ def figures(node: EskfNode, row: np.void) -> dict[str, object]:
 
 
 def phases(node: EskfNode) -> dict[str, object]:
-    """What the measurements of the first receiver are to the filter."""
-    if node.position_stream == Stream.PSEUDORANGE:
-        return {"position by pseudoranges": node.navigator.phase(Stream.PSEUDORANGE).name}
+    """What the measurements of the first receiver are to the filter, and of the other sensors those that came."""
+    usual: tuple[Stream, ...] = (Stream.PSEUDORANGE,)
+    if node.position_stream != Stream.PSEUDORANGE:
+        usual = (Stream.GNSS_POSITION, Stream.GNSS_VELOCITY)
+    found = {(stream, 0): node.navigator.phase(stream) for stream in usual}
+    for stream, source in SENSORS:
+        phase = node.navigator.phase(stream, source)
+        if phase != Phase.WAITING:
+            found[stream, source] = phase
     return {
-        "fixes": node.navigator.phase(Stream.GNSS_POSITION).name,
-        "velocities": node.navigator.phase(Stream.GNSS_VELOCITY).name,
+        PHASE_LABELS.get(stream, stream.name.lower().replace("_", " ")) + " of the second receiver" * source: phase.name
+        for (stream, source), phase in found.items()
     }
 
 
