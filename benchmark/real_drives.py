@@ -29,6 +29,8 @@ from scipy.stats import chi2
 
 from eskf_ros import earth, parameters
 from eskf_ros.bags import open_bag
+from eskf_ros.gnss.ranges import ionosphere_free, one_per_satellite
+from eskf_ros.gnss.signals import Gnss
 from eskf_ros.simulate.map_frame import MapFrame
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -39,6 +41,7 @@ from recordings import drive_0708, husky, tsukishima, walk  # noqa: E402
 from recordings.common import FIX, IMU, ODOMETRY, Outages, Recording, replayed, results_folder  # noqa: E402
 from recordings.kitti import kitti_recording  # noqa: E402
 from recordings.nagoya import nagoya_ranges_recording, nagoya_recording  # noqa: E402
+from recordings.static_mosaic import Pick, StaticReceiver, medium_earth_orbit  # noqa: E402
 from recordings.thor75 import thor75_recording  # noqa: E402
 
 Array = NDArray[np.float64]
@@ -92,6 +95,10 @@ TSUKISHIMA_RANGES = (
     Variant("tight", (*TIGHT, NO_WHEEL)),
     Variant("tight, wheel, NHC", (*TIGHT, *NHC)),
 )
+MASKED_COUNTS = (8, 4, 3, 2, 1, 0)
+MASKED_HEADINGS = ("satellites", "loose, horizontal, m", "inside 95 %", "tight, horizontal, m", "inside 95 %")
+STATIC_SYSTEMS = (Gnss.GPS, Gnss.GALILEO, Gnss.BEIDOU, Gnss.QZSS, Gnss.GLONASS)
+STATIC_HEADINGS = ("ranges", "3D rms, m", "east / north / up rms, m")
 RANGES = (
     Variant("loose, position only", (POSITION,)),
     Variant("loose, with velocity"),
@@ -250,7 +257,48 @@ def walk_figures(folder: Path) -> str:
         text += f"\nAt the end of outages of {length:g} s:\n\n{table(OUTAGE_HEADINGS, rows)}"
     with_ranges = walk.walk_ranges_recording(folder, find_data_folder("walk_0827"))
     rows = [variant_row(with_ranges, variant) for variant in RANGES]
-    return f"{text}\nOn our own point solutions, four times a second:\n\n{table(HEADINGS, rows)}"
+    text += f"\nOn our own point solutions, four times a second:\n\n{table(HEADINGS, rows)}"
+    masks = [masked_row(folder, count) for count in MASKED_COUNTS]
+    return f"{text}\nAfter 30 s with so many satellites, three times:\n\n{table(MASKED_HEADINGS, masks)}"
+
+
+def masked_row(folder: Path, count: int) -> list[str]:
+    """Horizontal errors when few satellites have been left for a while, loose and tight."""
+    cells = []
+    for variant in RANGES[1:]:
+        errors, inside = [], 0
+        for start, length in walk.MASKED:
+            recording = walk.walk_ranges_recording(folder, find_data_folder("walk_0827"), count, start, length)
+            replay = replay_with_outages(recording, variant, ())
+            last = int(np.searchsorted(replay.seconds, start + length)) - 1
+            errors.append(float(np.linalg.norm(replay.error[last])))
+            nees = replay.error[last] @ np.linalg.solve(replay.covariance[last], replay.error[last])
+            inside += int(nees <= chi2.ppf(0.95, 2))
+        cells += [cell(errors), str(inside)]
+    return [str(count), *cells]
+
+
+def static_figures(folder: Path) -> str:
+    """Point solutions of a receiver at rest."""
+    receiver = StaticReceiver(find_data_folder("static_mosaic"))
+    cases: tuple[tuple[str, tuple[Gnss, ...], Pick], ...] = (
+        ("one frequency, all", STATIC_SYSTEMS, one_per_satellite),
+        *((f"one frequency, {gnss.name}", (gnss,), one_per_satellite) for gnss in STATIC_SYSTEMS if gnss != Gnss.QZSS),
+        ("ionosphere-free, GPS, Galileo", STATIC_SYSTEMS[:2], ionosphere_free),
+        (
+            "ionosphere-free, GPS, Galileo, BeiDou's medium orbits",
+            STATIC_SYSTEMS[:3],
+            lambda ranges: ionosphere_free(ranges[medium_earth_orbit(ranges)]),
+        ),
+        ("ionosphere-free, GPS, Galileo, BeiDou, QZSS", STATIC_SYSTEMS[:4], ionosphere_free),
+    )
+    rows = []
+    for label, systems, pick in cases:
+        solutions = receiver.solutions(systems, pick)
+        off = np.array([solution.position_ecef - receiver.position for solution in solutions]) @ receiver.enu
+        east_north_up = np.sqrt(np.mean(off**2, axis=0)).tolist()
+        rows.append([label, cell([receiver.error(solutions)]), cell(east_north_up)])
+    return table(STATIC_HEADINGS, rows)
 
 
 def nagoya_figures(folder: Path) -> str:
@@ -286,6 +334,7 @@ DRIVES: dict[str, Callable[[Path], str]] = {
     "husky": husky_figures,
     "walk": walk_figures,
     "nagoya": nagoya_figures,
+    "static": static_figures,
 }
 
 

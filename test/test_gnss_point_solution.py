@@ -14,11 +14,11 @@ from gnss_sky import KLOBUCHAR, SECONDS, WEEK, Receiver, all_constellations, mea
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from recordings.static_mosaic import StaticReceiver, medium_earth_orbit, rms
 from recordings.tsukishima import ranges_of
 
-from eskf_ros.earth import east_north_up_to_ecef, geodetic_to_ecef
 from eskf_ros.gnss.ephemeris import Ephemerides
-from eskf_ros.gnss.point_solution import DEFAULT_SETTINGS, PointSettings, PointSolution, SolutionStatus, solve
+from eskf_ros.gnss.point_solution import DEFAULT_SETTINGS, PointSettings, SolutionStatus, solve
 from eskf_ros.gnss.range_model import NO_KLOBUCHAR, PREDICTION, predict
 from eskf_ros.gnss.ranges import (
     CODE_VALID,
@@ -29,8 +29,6 @@ from eskf_ros.gnss.ranges import (
     locate,
     one_per_satellite,
 )
-from eskf_ros.gnss.rinex_nav import read_navigation
-from eskf_ros.gnss.rinex_obs import read_observations
 from eskf_ros.gnss.signals import BEIDOU_3, L1, SPEED_OF_LIGHT, Gnss
 from eskf_ros.gnss.weighting import DEFAULT_WEIGHTING
 
@@ -249,41 +247,6 @@ def test_satellites_without_code_serve_the_velocity() -> None:
     assert solve(ranges, WEEK, SECONDS, KLOBUCHAR).status == SolutionStatus.TOO_FEW
 
 
-class StaticReceiver:
-    """The recording of a receiver at rest at a known place."""
-
-    def __init__(self, folder: Path) -> None:
-        navigation = read_navigation(folder / "base.nav")
-        self.ephemerides = Ephemerides(navigation.ephemerides)
-        self.klobuchar = navigation.klobuchar[Gnss.GPS]
-        self.observations = read_observations(folder / "rover.obs")
-        latitude, longitude, altitude = map(float, (folder / "rover_position_llh.txt").read_text().split())
-        self.position = np.array(geodetic_to_ecef(math.radians(latitude), math.radians(longitude), altitude))
-        self.enu = np.array(east_north_up_to_ecef(math.radians(latitude), math.radians(longitude)))
-
-    def solutions(
-        self, systems: tuple[Gnss, ...], pick: Callable[[NDArray[np.void]], NDArray[np.void]], step: int = 10
-    ) -> list[PointSolution]:
-        found = []
-        for index in range(0, len(self.observations.epochs), step):
-            epoch = self.observations.epochs[index]
-            ranges = self.observations.ranges(index)
-            ranges = ranges[np.isin(ranges["gnss_id"], systems)]
-            instant = int(epoch["week"]), float(epoch["seconds"])
-            locate(ranges, *instant, self.ephemerides)
-            found.append(solve(pick(ranges), *instant, self.klobuchar))
-            assert found[-1].status == found[-1].velocity_status == SolutionStatus.SOLVED
-        return found
-
-    def error(self, solutions: list[PointSolution]) -> float:
-        """3D rms, m."""
-        return rms(np.array([solution.position_ecef - self.position for solution in solutions]))
-
-
-def rms(errors: Array) -> float:
-    return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
-
-
 ALL = (Gnss.GPS, Gnss.GALILEO, Gnss.BEIDOU, Gnss.QZSS, Gnss.GLONASS)
 
 
@@ -325,14 +288,8 @@ def test_a_receiver_at_rest_free_of_the_ionosphere(static_folder: Path) -> None:
     receiver = StaticReceiver(static_folder)
     assert receiver.error(receiver.solutions(ALL[:4], ionosphere_free)) < 0.95
     assert receiver.error(receiver.solutions(ALL[:2], ionosphere_free)) < 1.25
-    # BeiDou's inclined and geostationary satellites have their own metre of delays.
     third = receiver.solutions(ALL[:3], lambda ranges: ionosphere_free(ranges[medium_earth_orbit(ranges)]))
     assert receiver.error(third) < 0.75
-
-
-def medium_earth_orbit(ranges: NDArray[np.void]) -> NDArray[np.bool_]:
-    beidou_3_meo = (ranges["sv_id"] >= 19) & (ranges["sv_id"] <= 37)
-    return (ranges["gnss_id"] != Gnss.BEIDOU) | beidou_3_meo
 
 
 def test_rtklib_is_no_closer(static_folder: Path) -> None:

@@ -38,6 +38,26 @@ class RangeEpochs:
         return RangeEpochs(self.time[chosen], self.week, self.seconds[chosen], kept)
 
 
+def masked(epochs: RangeEpochs, count: int, start: float, length: float) -> RangeEpochs:
+    """The epochs, of which those from `start` on (Unix s), for `length` s, have only the `count` strongest satellites.
+
+    By the sum of C/N0 over that time: those that were there throughout.
+    """
+    inside = (epochs.time >= start) & (epochs.time < start + length)
+    strength: dict[tuple[int, int], float] = {}
+    for ranges in (ranges for ranges, is_in in zip(epochs.ranges, inside, strict=True) if is_in):
+        for satellite in np.unique(ranges[["gnss_id", "sv_id"]]).tolist():
+            of_one = (ranges["gnss_id"] == satellite[0]) & (ranges["sv_id"] == satellite[1])
+            strength[satellite] = strength.get(satellite, 0.0) + float(ranges["cn0"][of_one].max())
+    kept = sorted(strength, key=lambda satellite: -strength[satellite])[:count]
+    stays = [
+        np.array([not is_in or (row["gnss_id"], row["sv_id"]) in kept for row in ranges], np.bool_)
+        for ranges, is_in in zip(epochs.ranges, inside, strict=True)
+    ]
+    left = [ranges[chosen] for ranges, chosen in zip(epochs.ranges, stays, strict=True)]
+    return RangeEpochs(epochs.time, epochs.week, epochs.seconds, left)
+
+
 def gnss_ranges(epochs: RangeEpochs, arrival: Array) -> Messages:
     """`gnss/ranges`; with satellites where the ranges know them."""
     clouds = []

@@ -37,7 +37,7 @@ from recordings.common import (
     truth_fix,
     write_bag,
 )
-from recordings.satellites import RangeEpochs, gnss_ephemerides, gnss_ranges, solved_fixes
+from recordings.satellites import RangeEpochs, gnss_ephemerides, gnss_ranges, masked, solved_fixes
 
 WEEK = 2381
 STANDARD_GRAVITY = 9.80665
@@ -63,7 +63,12 @@ INSTALLATION = f"""\
 NOISE = """\
     # A hand points it elsewhere than the feet go.
     alignment.use_course: false
+    # A clock that is shaken.
+    ranges.clock_drift_noise: 0.6
 """
+
+MASKED = ((25.0, 30.0), (40.0, 30.0), (55.0, 30.0))
+"""When few satellites are left (start, length in s), in replays of their own."""
 
 OUTAGE_SETS = {
     15.0: (((25.0, 15.0), (60.0, 15.0)), ((40.0, 15.0),), ((50.0, 15.0),), ((70.0, 15.0),)),
@@ -93,8 +98,12 @@ def walk_recording(folder: Path, source: Path) -> Recording:
     return Recording(bag, INSTALLATION, NOISE)
 
 
-def walk_ranges_recording(folder: Path, source: Path) -> Recording:
+def walk_ranges_recording(
+    folder: Path, source: Path, count: int | None = None, start: float = 0.0, length: float = 0.0
+) -> Recording:
     """Write the walk with ranges, ephemerides and our own point solutions four times a second.
+
+    With a `count` only so many satellites are there from `start` on, for `length` (s from the first IMU sample).
 
     Truth are all fixed RTK positions, shifted by what they differ from the point solutions on the average: the datum of
     the base station, and what is common to the errors of the point solutions.
@@ -105,7 +114,10 @@ def walk_ranges_recording(folder: Path, source: Path) -> Recording:
     solved, velocity_time, velocity, velocity_std = solved_fixes(epochs, ephemerides)
     reference, _, _ = read_solution(source)
     shift = np.mean(differences(solved, reference), axis=0)
-    bag = folder / "walk_ranges.mcap"
+    if count is not None:
+        epochs = masked(epochs, count, time[0] + start, length)
+        solved, velocity_time, velocity, velocity_std = solved_fixes(epochs, ephemerides)
+    bag = folder / ("walk_ranges.mcap" if count is None else "walk_masked.mcap")
     write_bag(
         bag,
         imu(time, specific_force, angular_rate),
