@@ -697,7 +697,7 @@ class Ranges(Aid):
         live=True,
     )
     correlation_time: float = _parameter(
-        300.0,
+        120.0,
         "s",
         "How long the common error of the pseudoranges lasts (e-folding time): reflections, orbits, what the models "
         "leave of the atmosphere. 0: not modelled, and the estimate then trusts the mean of many epochs too much.",
