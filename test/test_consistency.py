@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from kernels import core
 
-from eskf_ros.filter import layout, navigator, settings, strapdown, update
+from eskf_ros.filter import fusion, layout, navigator, settings, strapdown, update
 from eskf_ros.filter.layout import ACCEL_BIAS, GYRO_BIAS
 from eskf_ros.parameters import from_mapping
 from eskf_ros.rotation import to_matrix
@@ -199,7 +199,7 @@ class FrozenGain:
             aid = layout.allocate(layout.AID)[0]
             aid["stream"] = stream
             aid["payload"][:9] = np.concatenate([values, covariance[six]])
-            navigator.linearize(self.state, aid, self.settings, self.work)
+            fusion.linearize(self.state, aid, self.settings, self.work)
             body_to_map = np.array(to_matrix(tuple(self.state["attitude"])))
             if stream not in self.gains:
                 self.gains[stream] = self.optimal_gain(body_to_map)

@@ -180,7 +180,7 @@ def test_the_ionosphere_of_qzss_out_of_a_file(tmp_path: Path, letter: str) -> No
     intake.take_ranges(STAMP, epoch())
     assert bool(intake.recent_complaints) == (letter == "BDS")
     first = DEFAULT_KLOBUCHAR[0] if letter == "BDS" else 1.8626e-8
-    assert intake._serving(STAMP)[1][0] == first
+    assert intake._serving(STAMP, (WEEK, TOW))[1][0] == first
 
 
 def test_two_hundred_signals_of_an_epoch_go_through_the_filter_and_are_counted() -> None:

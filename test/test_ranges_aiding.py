@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
 from eskf_ros.filter import optional
 from eskf_ros.filter.aiding import pseudorange, range_rate
+from eskf_ros.filter.aiding import signal as signal_place
 from eskf_ros.filter.aiding.signal import FLAGS, MEASURED, SATELLITE, SATELLITE_VELOCITY, STD, source_of
 from eskf_ros.filter.layout import ERROR_SIZE, INTER_SYSTEM, NOWHERE, PAYLOAD_SIZE, Stream
 from eskf_ros.gnss.measurements import MEASURED_SIGNAL, predict_measured
@@ -139,7 +140,8 @@ def test_prediction_and_noise_are_those_of_the_range_model(seed: int, flags: int
     klobuchar = KLOBUCHAR if has_model else NO_KLOBUCHAR
     state = tight_state(seed)
     payload, work = signal_payload(state, seed, 25.0, flags), make_work()
-    payload[MEASURED], payload[13:] = 22.1e6, klobuchar
+    payload[MEASURED] = 22.1e6
+    payload[signal_place.KLOBUCHAR : signal_place.KLOBUCHAR + 8] = klobuchar
     turn = to_rotation(state["attitude"])
     arm = settings["lever_arms_body"][0]
     rate = state["angular_rate"] - state["gyro_bias"] - turn.inv().apply(state["earth_rate_map"])

@@ -29,7 +29,7 @@ from eskf_ros.simulate.scenario import Recording, simulate
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "benchmark"))
 
-from monte_carlo import nees, state_error
+from monte_carlo import NO_REST, nees, state_error
 
 Array = NDArray[np.float64]
 
@@ -439,7 +439,7 @@ def test_the_covariance_is_honest_with_any_number_of_satellites(satellites: int)
             hidden = np.ones(len(ranges.signals[k]), bool)
             hidden[kept] = False
             ranges.signals[k]["status"][hidden] = RangeStatus.LOW_CN0
-        outcome = follow(recording, ranges, tight_navigator(recording))
+        outcome = follow(recording, ranges, tight_navigator(recording, **NO_REST))
         errors = np.concatenate([outcome.error, outcome.clock_error], axis=1)
         late = outcome.seconds > 75.0
         for name, block in blocks.items():
@@ -461,7 +461,8 @@ def test_too_steady_a_clock_model_is_not_honest() -> None:
             hidden = np.ones(len(ranges.signals[k]), bool)
             hidden[kept] = False
             ranges.signals[k]["status"][hidden] = RangeStatus.LOW_CN0
-        navigator = tight_navigator(recording, ranges__clock_drift_noise=0.03, ranges__clock_bias_noise=0.01)
+        steady = {"ranges__clock_drift_noise": 0.03, "ranges__clock_bias_noise": 0.01}
+        navigator = tight_navigator(recording, **steady, **NO_REST)
         outcome = follow(recording, ranges, navigator)
         late = outcome.seconds > 75.0
         values.append(nees(outcome.error[late], outcome.covariance[late], slice(3, 6)).mean())
