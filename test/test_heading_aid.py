@@ -249,7 +249,7 @@ def test_a_wild_message_does_not_start_the_filter(place: int) -> None:
     assert abs(heading_error(recording, navigator)) < 4.0
 
 
-@pytest.mark.parametrize("name", ["multirotor", "drive"])
+@pytest.mark.parametrize("name", ["multirotor", "drive", "boat"])
 def test_the_covariance_is_honest_with_a_dual_antenna(name: str) -> None:
     attitude, position, known = [], [], []
     for seed in range(4):

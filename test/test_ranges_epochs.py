@@ -481,10 +481,18 @@ class Message:
 
 @pytest.fixture(scope="module")
 def pull_away() -> tuple[Recording, Ranges]:
-    """Levelling, datum, search for the heading, a jump of the clock, a lost majority: all lie inside."""
+    """Levelling, datum, search for the heading, a jump of the clock, a lost majority: all lie inside.
+
+    Galileo rises late, so that its offset joins on the way, and one satellite sets and returns.
+    """
     recording = simulate("drive", 3, imu_rate=50.0, start=12.0, stop=40.0)
-    ranges = simulate_ranges(recording, 17, rate=2.0, systems=GPS)
+    ranges = simulate_ranges(recording, 17, rate=2.0, systems=(Gnss.GPS, Gnss.GALILEO))
+    returning = np.flatnonzero(ranges.signals[0]["status"] == RangeStatus.USABLE)[0]
     for k, signals in enumerate(ranges.signals):
+        if k < 16:
+            signals["status"][signals["gnss_id"] == Gnss.GALILEO] = RangeStatus.LOW_ELEVATION
+        if 20 <= k < 30:
+            signals["status"][returning] = RangeStatus.LOW_ELEVATION
         signals["pseudorange"] += MILLISECOND if k > 25 else 0.0
         if k in (40, 41):
             majority = np.flatnonzero(signals["status"] == RangeStatus.USABLE)[1:]

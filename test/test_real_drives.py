@@ -19,7 +19,7 @@ from recordings.kitti import kitti_recording
 from recordings.nagoya import nagoya_recording
 from recordings.thor75 import thor75_recording
 from recordings.tsukishima import OUTAGE_SETS as TOKYO_OUTAGES
-from recordings.tsukishima import REAR_AXLE, tsukishima_recording
+from recordings.tsukishima import REAR_AXLE, TIME_OFFSET, tsukishima_ranges_recording, tsukishima_recording
 from recordings.walk import walk_ranges_recording, walk_recording
 
 MARGIN = 1.25
@@ -177,6 +177,19 @@ def test_tsukishima_rolls_on_through_outages(tmp_path: Path, data_folder: Callab
     assert len(ends) > 15
     assert np.median(ends) < 1.5
     assert np.percentile(ends, 95.0) < 7.0
+
+
+def test_tsukishima_tight_coupling_beats_loose(tmp_path: Path, data_folder: Callable[[str], Path]) -> None:
+    """On the same signals and the same epochs, with and without the constant that all of them are off."""
+    recording = tsukishima_ranges_recording(tmp_path, data_folder("tsukishima_20201105"))
+    tight_lines = ("mode: tight", f"ranges.time_offset: {TIME_OFFSET}")
+    for truth, share in (("truth", 0.85), ("truth_shifted", 0.6)):
+        loose = replayed(recording, "wheel.use: false", truth=truth)
+        tight = replayed(recording, "wheel.use: false", *tight_lines, truth=truth)
+        assert abs(tight["truth"]["compared"] - loose["truth"]["compared"]) < 0.01 * loose["truth"]["compared"]
+        assert tight["error"]["horizontal"]["p95"] < share * loose["error"]["horizontal"]["p95"]
+        assert tight["error"]["horizontal"]["max"] < 0.6 * loose["error"]["horizontal"]["max"]
+        assert tight["nees"]["position"]["mean"] < 0.2 * loose["nees"]["position"]["mean"]
 
 
 def test_thor75_agrees_with_the_filter_on_board(tmp_path: Path, data_folder: Callable[[str], Path]) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from aided import run
+from aided import run, run_aided
 from kernels import copy_of, make_settings, make_work, random_state, with_error
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -16,6 +16,8 @@ from eskf_ros.filter.aiding import body_velocity, zaru, zupt
 from eskf_ros.filter.layout import CONSTRAINT_INTERVAL, GYRO_BIAS, Stream, Verdict
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.parameters import from_mapping
+from eskf_ros.simulate.body_velocity import BodyVelocity
+from eskf_ros.simulate.episodes import Outage
 from eskf_ros.simulate.scenario import simulate
 from eskf_ros.simulate.wheel import WheelOdometer
 
@@ -125,6 +127,30 @@ def through(name: str, seed: int, zupt_enabled: bool, **options: Any) -> tuple[A
     given = {**recording.parameters(), **heading, "zupt.enabled": zupt_enabled}
     navigator = Navigator(from_mapping(given))
     return run(recording, navigator, 1.0), navigator
+
+
+@pytest.mark.parametrize(("name", "axes"), [("multirotor", "xy"), ("boat", "xyz")])
+def test_velocities_of_the_body_carry_through_an_outage(name: str, axes: str) -> None:
+    """An optical flow sensor on a multirotor, a Doppler log on a boat: half a minute without GNSS."""
+    ends: dict[bool, list[float]] = {True: [], False: []}
+    heading = {"alignment__initial_heading_std_deg": 1.0}
+    for seed in range(4):
+        sensor = BodyVelocity(axes=axes, rate=10.0)
+        recording = simulate(
+            name, seed, grade="consumer", imu_rate=50.0, stop=80.0, body_velocity=sensor, episodes=(Outage(45.0, 30.0),)
+        )
+        w, x, y, z = recording.truth_attitude_body_to_map[0]
+        heading["alignment__initial_heading_deg"] = math.degrees(
+            math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        )
+        for is_used, kept in ends.items():
+            result = run_aided(recording, 1.0, body_velocity__use=is_used, **heading)
+            end = int(np.searchsorted(result.seconds, 74.5))
+            kept.append(float(np.linalg.norm(result.error[end, :2])))
+            if is_used:
+                covariance = result.covariance[end, :2, :2]
+                assert result.error[end, :2] @ np.linalg.solve(covariance, result.error[end, :2]) < 14.0
+    assert np.median(ends[True]) < 0.25 * np.median(ends[False]), ends
 
 
 def test_the_heading_of_a_parked_robot_does_not_drift() -> None:
