@@ -19,6 +19,10 @@ from eskf_ros.node.transforms import TransformOutput
 from eskf_ros.parameters import Parameters
 
 OUTPUT_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+
+ODOMETRY_QOS = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
+"""After a stall a second of the IMU is answered at once: what a subscriber missed of that has to be there still."""
+
 OVERRIDING = QoSOverridingOptions.with_default_policies()
 
 
@@ -41,8 +45,10 @@ class Outputs:
         frames = parameters.frames
         self._global_writer = self._writer(frames.map, frames.base_link)
         self._local_writer = self._writer(frames.odom, frames.base_link)
-        self._global = node.create_publisher(Odometry, "odometry/global", OUTPUT_QOS, qos_overriding_options=OVERRIDING)
-        self._local = node.create_publisher(Odometry, "odometry/local", OUTPUT_QOS, qos_overriding_options=OVERRIDING)
+        self._global = node.create_publisher(
+            Odometry, "odometry/global", ODOMETRY_QOS, qos_overriding_options=OVERRIDING
+        )
+        self._local = node.create_publisher(Odometry, "odometry/local", ODOMETRY_QOS, qos_overriding_options=OVERRIDING)
         self.publishers = (self._global, self._local)
         self.transforms = self._open_transforms(parameters)
 
