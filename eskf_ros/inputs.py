@@ -3,9 +3,11 @@
 Both read serialised messages into batches (`eskf_ros.bags`), a recording by the thousand and the node one by one; from
 there on they share what is here, so that they give the estimator the same numbers, bit for bit.
 
-A new input is a row of `INPUTS`, a function that makes arguments of its messages, and the parameter ``topics.NAME``; a
-message type that is not there yet is a row of `bags.messages.MESSAGE_TYPES`. A second type for the same thing is an
-entry in ``others`` and a choice of the parameter ``topics.NAME_type``.
+A new input is a row of `INPUTS`, a function that makes arguments of its messages, and the parameter ``topics.NAME``; in
+the estimator it is a `Stream`, its `Intake` (`filter.settings`), a file in `filter.aiding` and the line in
+`filter.fusion.linearize` that calls it. A message type that is not there yet is a row of
+`bags.messages.MESSAGE_TYPES`. A second type for the same thing is an entry in ``others`` and a choice of the parameter
+``topics.NAME_type``.
 """
 
 from __future__ import annotations

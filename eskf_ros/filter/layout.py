@@ -65,7 +65,7 @@ class Status(IntEnum):
     """What the estimator has, in the order in which it gets it.
 
     COASTING: no position was accepted for a while. DEGRADED: fixes come and contradict the estimate. FAULT: the
-    estimate is not finite, only a reset helps.
+    estimate is not finite or a variance negative, only a reset helps.
     """
 
     WAITING_IMU = 0
@@ -97,7 +97,7 @@ class Phase(IntEnum):
 class Verdict(IntEnum):
     """What became of an offered measurement (a closed list; files show the names in lower case).
 
-    INACTIVE is for constraints that do not hold at the moment, such as rest while the robot moves: it leaves no record.
+    INACTIVE is for what says nothing at the moment, such as rest while the robot moves: it leaves no record.
     CONTRADICTED: a position that moves otherwise than the velocity of the same receiver. RESET: it is the last of so
     many rejected ones that agree with each other that the filter gave in.
     """

@@ -199,8 +199,9 @@ def is_on_grid(previous_stamp, stamp, interval):
 class Navigator:
     """Error-state Kalman filter over a timeline: the same for the node and for the replay.
 
-    Stamps are int64 nanoseconds on the IMU's clock. Pushes only sort a message into the timeline; the next
-    ``push_imu`` or ``update`` does the work. See ``layout`` for the fields of rows (ODOMETRY) and records (RECORD).
+    Stamps are int64 nanoseconds on the IMU's clock. A push sorts a message into the timeline; the next ``push_imu``
+    or ``update``, or a push that finds the buffers full, does the work. See ``layout`` for the fields of rows
+    (ODOMETRY) and records (RECORD).
     """
 
     def __init__(self, parameters: Parameters, output_rate: float = 0.0) -> None:

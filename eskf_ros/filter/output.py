@@ -30,7 +30,7 @@ CONTRADICTIONS = 3
 
 @njit
 def status_of(state, settings):
-    """Return the rung of the ladder; coasting is a second without a fix, or twice the usual wait if that is longer."""
+    """Return the rung of the ladder; coasting is a second without a fix, or twice the usual wait up to three."""
     if state.imu_stamp == NEVER:
         return WAITING_IMU
     if state.level_known == 0:

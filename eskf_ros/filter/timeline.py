@@ -1,9 +1,9 @@
 """The timeline: what the estimator was told in the last seconds, in one total order, and checkpoints to go back to.
 
-The order is (stamp, stream rank, payload bits). IMU samples and aids wait in two sorted buffers. A checkpoint is a
-copy of the whole state right after an IMU sample and before the aids of the same stamp. What arrives behind the state
-only marks how far to go back: the next advance restores the newest checkpoint before it and applies again all that
-follows, so the result is a function of the sorted contents alone.
+The order is (stamp, stream rank, source, door, payload). IMU samples and aids wait in two sorted buffers. A checkpoint
+is a copy of the whole state right after an IMU sample and before the aids of the same stamp. What arrives behind the
+state only marks how far to go back: the next advance restores the newest checkpoint before it and applies again all
+that follows, so the result is a function of the sorted contents alone.
 
 Constraints (rest, no side slip), which no sensor sends, lie among the aids on a grid of stamps, wherever IMU samples
 are close together.

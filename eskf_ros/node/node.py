@@ -313,7 +313,7 @@ class EskfNode(Node):
             self._aids.publish(record_statuses(refused, stamp))
         row, datum = self.navigator.odometry[0], self.navigator.datum
         if row["status"] == Status.FAULT:
-            self.trouble.note("the estimate is not finite: call the service ~/reset")
+            self.trouble.note("the estimate or its covariance is broken: call the service ~/reset")
         else:
             self._bias.publish(bias_message(row, self._imu_frame))
             if row["position_known"] and datum is not None:
