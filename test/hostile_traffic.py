@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -261,11 +262,14 @@ class Listener:
         taken = {}
         for topic, data in self._received.items():
             kind = OUTPUTS[topic]
-            # The node's frames do not change, so all messages of a topic have one length.
-            rows = np.frombuffer(b"".join(data), np.uint8).reshape(len(data), len(data[0]) if data else 0)
-            messages, valid = decode(kind, rows, StringTable())
-            assert valid is None, f"{topic}: the node published what is no {kind}"
-            taken[topic] = messages
+            parts = []
+            # The length of a message changes when the frame of the IMU becomes known.
+            for length, group in groupby(data or [b""], len):
+                rows = np.frombuffer(b"".join(group), np.uint8).reshape(-1 if length else 0, length)
+                messages, valid = decode(kind, rows, StringTable())
+                assert valid is None, f"{topic}: the node published what is no {kind}"
+                parts.append(messages)
+            taken[topic] = np.concatenate(parts)
             data.clear()
         return taken
 
