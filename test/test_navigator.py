@@ -11,8 +11,11 @@ from hypothesis import strategies as st
 from kernels import core
 
 from eskf_ros.earth import ecef_to_geodetic
-from eskf_ros.filter.layout import ODOMETRY, RECORD, Status, Verdict
+from eskf_ros.filter.fusion import offer
+from eskf_ros.filter.layout import AID, ODOMETRY, RECORD, Status, Stream, Verdict, allocate
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.filter.settings import settings_from
+from eskf_ros.filter.timeline import EARLY_AIDS
 from eskf_ros.parameters import Parameters, from_mapping
 from eskf_ros.simulate.scenario import Recording, simulate
 
@@ -385,3 +388,57 @@ def test_a_new_datum_is_the_same_place(recording):
 
 def test_without_a_position_there_is_no_datum_here():
     assert not Navigator(from_mapping({})).set_datum_here()
+
+
+def test_stamps_in_float_seconds_are_refused_with_the_remedy():
+    navigator = Navigator(Parameters())
+    with pytest.raises(TypeError, match="int64 nanoseconds"):
+        navigator.push_imu(np.array([1.0, 1.01]), np.zeros((2, 3)), np.zeros((2, 3)))
+    with pytest.raises(TypeError, match="int64 nanoseconds"):
+        navigator.push_gnss_velocity(1.5, (0.0, 0.0, 0.0), GOOD_COVARIANCE)  # type: ignore[arg-type]
+    assert navigator.imu_counts["offered"] == 0
+
+
+@pytest.mark.parametrize(("force", "rate"), [((3, 3), (2, 3)), ((2, 3), (3,)), ((2, 4), (2, 3))])
+def test_imu_arrays_of_another_shape_are_refused_by_name(force: tuple[int, ...], rate: tuple[int, ...]):
+    with pytest.raises(ValueError, match=r"(specific_force|angular_rate) has the shape .* 2 stamps need \(2, 3\)"):
+        Navigator(Parameters()).push_imu(np.array([1, 2]), np.zeros(force), np.zeros(rate))
+
+
+def test_a_covariance_is_nine_numbers_or_three_by_three(recording: Recording):
+    def pushed(covariance: np.ndarray) -> np.ndarray:
+        navigator, _ = run(recording)
+        stamp = int(recording.imu_stamp[-1])
+        navigator.push_gnss_velocity(stamp, (1.0, 2.0, 0.1), covariance)
+        navigator.update()
+        return navigator.state
+
+    covariance = np.array([[1.0, 0.2, 0.0], [0.2, 2.0, 0.1], [0.0, 0.1, 4.0]])
+    assert pushed(covariance).tobytes() == pushed(covariance.ravel()).tobytes()
+    with pytest.raises(ValueError, match="nine numbers"):
+        Navigator(Parameters()).push_gnss_velocity(1, (0.0, 0.0, 0.0), np.ones(3))
+
+
+def test_measurements_dropped_before_the_first_imu_sample_are_said():
+    navigator = Navigator(Parameters())
+    for k in range(EARLY_AIDS + 3):
+        navigator.push_gnss_velocity(SECOND + k, (0.0, 0.0, 0.0), GOOD_COVARIANCE)
+    (sentence,) = navigator.complaints
+    assert "3 messages of gnss_velocity were dropped" in sentence
+    assert "order of their stamps" in sentence
+
+
+@pytest.mark.parametrize("stream", [stream for stream in Stream if stream != Stream.IMU])
+def test_every_stream_has_a_gate(stream: Stream):
+    assert (settings_from(Parameters())["gate"][0, stream, 1:] > 0.0).all()
+
+
+def test_a_stream_without_a_model_is_refused_with_a_record(recording: Recording):
+    """Signals of ranges go another way: to `fusion` they are streams of which it knows no model."""
+    navigator, _ = run(recording)
+    state, aid = navigator._states.copy(), allocate(AID)
+    aid["stream"] = Stream.PSEUDORANGE
+    before = state["covariance"].copy()
+    offer(state[0], aid[0], 0.0, navigator._settings[0], navigator._work[0])
+    assert aid["verdict"][0] == Verdict.DISABLED
+    assert np.array_equal(before, state["covariance"])

@@ -46,6 +46,10 @@ FUSED = int(Verdict.FUSED)
 GATE = int(Verdict.GATE)
 BEFORE_ALIGNMENT = int(Verdict.BEFORE_ALIGNMENT)
 INACTIVE = int(Verdict.INACTIVE)
+DISABLED = int(Verdict.DISABLED)
+
+UNKNOWN_STREAM = -1
+"""Instead of a size, for a stream without a branch in `linearize`: it is refused with a record, never fused."""
 
 
 @njit
@@ -136,6 +140,9 @@ def measure(state, aid, heading_before, settings, work):
             note(state, MAG, aid.source, GATE)
             return 0
     size = linearize(state, aid, settings, work)
+    if size == UNKNOWN_STREAM:
+        aid.verdict = DISABLED
+        return 0
     if size == 0:
         aid.verdict = INACTIVE
         return 0
@@ -170,7 +177,7 @@ def is_aligned_for(state, stream):
 def linearize(state, aid, settings, work):
     """Write innovation, Jacobian and noise of one measurement to ``work``; return its size. The list of aids.
 
-    Size 0: the measurement says nothing in this state.
+    Size 0: the measurement says nothing in this state. `UNKNOWN_STREAM`: nothing here knows what it measures.
     """
     if aid.stream == GNSS_POSITION:
         return gnss_position.linearize(state, aid.payload, aid.source, settings, work)
@@ -190,4 +197,6 @@ def linearize(state, aid, settings, work):
         return mag.linearize(state, aid.payload, settings, work)
     if aid.stream == BARO:
         return baro.linearize(state, aid.payload, aid.source, settings, work)
-    return gnss_velocity.linearize(state, aid.payload, aid.source, settings, work)
+    if aid.stream == GNSS_VELOCITY:
+        return gnss_velocity.linearize(state, aid.payload, aid.source, settings, work)
+    return UNKNOWN_STREAM

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections import Counter
 from collections.abc import Sequence
 
@@ -50,6 +51,7 @@ from eskf_ros.filter.strapdown import SECOND, propagate
 from eskf_ros.filter.sway import add_to_part
 from eskf_ros.filter.timeline import (
     CHECKPOINT_SPACING,
+    EARLY_AIDS,
     doubled,
     forget,
     insert_imu,
@@ -250,6 +252,7 @@ class Navigator:
         self._refused_count: Counter[Stream] = Counter()
         self._shut_doors: Counter[tuple[Stream, Verdict]] = Counter()
         self._stamp_difference: dict[Stream, float] = {}
+        self._early: Counter[Stream] = Counter()
         self._stand_ins = 0
         self.range_statuses: Counter[RangeStatus] = Counter()
         """What became of the signals before they entered the timeline: how many are usable, and why others are not."""
@@ -309,10 +312,14 @@ class Navigator:
         """Take IMU samples, shapes (n,), (n, 3) m/s2, (n, 3) rad/s in IMU axes, and run the filter up to the newest.
 
         Returns the ODOMETRY rows of the newly processed samples on the output grid, as they would have been published.
+
+        Raises:
+            TypeError: the stamps are not integers: seconds as floats cannot hold nanoseconds.
+            ValueError: an array has another shape.
         """
-        stamps = np.ascontiguousarray(stamps, np.int64)
-        specific_force = np.ascontiguousarray(specific_force, np.float64)
-        angular_rate = np.ascontiguousarray(angular_rate, np.float64)
+        stamps = _nanoseconds(stamps)
+        specific_force = _vectors("specific_force", specific_force, len(stamps))
+        angular_rate = _vectors("angular_rate", angular_rate, len(stamps))
         parts = []
         first = 0
         while first < len(stamps):
@@ -369,7 +376,7 @@ class Navigator:
         """
         gnss = self.parameters.gnss
         stand_in = NO_STAND_IN
-        matrix = np.ascontiguousarray(covariance, np.float64)
+        matrix = _nine(covariance)
         if covariance_type == 0 or not matrix.any():
             level = min(max(status, 0), 2)
             horizontal, vertical = gnss.status_std_horizontal[level] ** 2, gnss.status_std_vertical[level] ** 2
@@ -636,6 +643,12 @@ class Navigator:
             offered = self._offered_count[stream]
             if verdict in DOOR_REMEDIES and count >= FEWEST_REFUSED and 2 * count > offered:
                 found.append(f"{count} of {offered} messages of {stream.name.lower()} {DOOR_REMEDIES[verdict]}")
+        for stream, count in self._early.items():
+            found.append(
+                f"{count} messages of {stream.name.lower()} were dropped because more than {EARLY_AIDS} measurements "
+                "waited for the first IMU sample: push measurements and IMU samples in the order of their stamps, or "
+                "look why the IMU is silent"
+            )
         for stream, difference in self._stamp_difference.items():
             if 2 * self._refused_count[stream] > self._offered_count[stream]:
                 found.append(
@@ -664,7 +677,7 @@ class Navigator:
     def _take(self, stream: Stream, values: Sequence[float], covariance: Sequence[float] | FloatArray) -> int:
         """Fill the payload on offer, with the stand-in where no covariance came; return its door."""
         intake = self._intakes[stream]
-        matrix = np.ascontiguousarray(covariance, np.float64)
+        matrix = _nine(covariance)
         is_absent = not matrix.any() or (matrix[0] < 0.0 and not intake.may_lack_axes)
         if intake.largest_variance < math.inf:
             matrix = np.where((matrix > intake.largest_variance) & (DIAGONAL == 1.0), ABSENT, matrix)
@@ -726,12 +739,15 @@ class Navigator:
         if door != OPEN_DOOR:
             self._shut_doors[stream, Verdict(door)] += 1
         self._make_room()
+        stamp = _nanosecond(stamp)
         refused = offer_aid(self._aids, self._timeline, self._offered, stamp, arrival, int(stream), source, door)
         if refused:
             self._refuse(stream, stamp, arrival, source, Verdict(refused))
 
     def _refuse(self, stream: Stream, stamp: int, arrival: int, source: int, verdict: Verdict) -> None:
         """Record a measurement that never enters the timeline."""
+        if verdict == Verdict.BEFORE_ALIGNMENT:
+            self._early[stream] += 1
         self._note_refused(stream, stamp)
         record = (stamp, arrival, stream, source, verdict, 0, math.nan, (math.nan,) * 3)
         self._refused.append(np.array([record], RECORD))
@@ -806,3 +822,42 @@ def compile_kernels() -> None:
 def _copied(records: np.ndarray, count: int) -> np.ndarray:
     """Return the first records in memory of their own: through bytes, because numpy copies them field by field."""
     return np.frombuffer(bytearray(records[:count].tobytes()), records.dtype)
+
+
+def _nanosecond(stamp: int) -> int:
+    """Return a stamp as an int; raises TypeError for one that is not an integer."""
+    try:
+        return operator.index(stamp)
+    except TypeError:
+        raise TypeError(
+            f"the stamp {stamp!r} is not an integer: stamps are int64 nanoseconds; for seconds: round(seconds * 1e9)"
+        ) from None
+
+
+def _nanoseconds(stamps: StampArray) -> StampArray:
+    """Return stamps as int64; raises TypeError for those that are not integers."""
+    found = np.asarray(stamps)
+    if found.ndim != 1:
+        raise ValueError(f"stamps have the shape {found.shape}; one row of n is needed: (n,)")
+    if len(found) and not np.issubdtype(found.dtype, np.integer):
+        raise TypeError(
+            f"stamps are of type {found.dtype}: they must be int64 nanoseconds; for seconds: "
+            "np.round(seconds * 1e9).astype(np.int64)"
+        )
+    return np.ascontiguousarray(found, np.int64)
+
+
+def _vectors(name: str, values: FloatArray, count: int) -> FloatArray:
+    """Return a vector for each of ``count`` stamps as float64 (n, 3); raises ValueError for another shape."""
+    found = np.ascontiguousarray(values, np.float64)
+    if found.shape != (count, 3):
+        raise ValueError(f"{name} has the shape {found.shape}; {count} stamps need ({count}, 3)")
+    return found
+
+
+def _nine(covariance: Sequence[float] | FloatArray) -> FloatArray:
+    """Return a covariance, (9,) row-major or (3, 3), as (9,); raises ValueError for another size."""
+    found = np.ascontiguousarray(covariance, np.float64)
+    if found.shape not in ((9,), (3, 3)):
+        raise ValueError(f"a covariance has the shape {found.shape}; nine numbers row by row or (3, 3) are needed")
+    return found.reshape(9)

@@ -210,8 +210,11 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
     settings["mag_inclination_tolerance"] = math.radians(mag.inclination_tolerance_deg)
     settings["mag_error_distance"] = mag.error_distance
     settings["is_orientation_magnetic"] = alignment.imu_orientation == "magnetic_north"
-    for stream, probability in gate_probabilities(parameters).items():
-        settings["gate"][0, stream, 1:] = chdtri([1, 2, 3], 1.0 - probability)
+    probabilities = gate_probabilities(parameters)
+    for stream in Stream:
+        if stream != Stream.IMU:
+            # A stream without a probability is a KeyError here: a gate of zero would refuse it for ever.
+            settings["gate"][0, stream, 1:] = chdtri([1, 2, 3], 1.0 - probabilities[stream])
     settings["constrains"][0, Stream.ZUPT] = settings["constrains"][0, Stream.ZARU] = parameters.zupt.enabled
     settings["constrains"][0, Stream.NHC] = parameters.nhc.enabled
     settings["gnss_covariance_scale"] = parameters.gnss.covariance_scale
