@@ -29,9 +29,9 @@ from scipy.stats import chi2
 
 from eskf_ros import earth, parameters
 from eskf_ros.bags import open_bag
+from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.gnss.ranges import ionosphere_free, one_per_satellite
 from eskf_ros.gnss.signals import Gnss
-from eskf_ros.simulate.map_frame import MapFrame
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "test"))

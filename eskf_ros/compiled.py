@@ -12,9 +12,11 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import itertools
+import math
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -28,6 +30,12 @@ except ImportError:
 
 COMPILED: bool = numba is not None and not numba.config.DISABLE_JIT
 """True when the kernels run as machine code."""
+
+PROGRESS_PERIOD = 5.0
+"""Seconds from one sentence about compiling to the next."""
+
+USUAL_COUNT = 500
+"""Functions, each type of arguments counted, that a first start compiles, about: for the estimate of progress only."""
 
 _KEPT_CACHES = 4
 
@@ -88,6 +96,24 @@ def while_compiling(tell: Callable[[int], None]) -> Iterator[None]:
 
     with event.install_listener("numba:compile", Listener()):
         yield
+
+
+def sentence_on_compiling(say: Callable[[str], None]) -> Callable[[int], None]:
+    """Return what `while_compiling` calls, which calls ``say`` with a sentence at once and then every few seconds."""
+    started, told = time.monotonic(), -math.inf
+
+    def tell(count: int) -> None:
+        nonlocal told
+        now = time.monotonic()
+        if now - told > PROGRESS_PERIOD:
+            told = now
+            share = min(99, 100 * count // USUAL_COUNT)
+            say(
+                f"compiling the estimator: {count} functions in {now - started:.0f} s, about {share} % "
+                "(only the first start after an installation)"
+            )
+
+    return tell
 
 
 if COMPILED:

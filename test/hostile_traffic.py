@@ -20,8 +20,8 @@ from robot import TYPES
 from ros_process import Ros
 
 from eskf_ros.bags import StringTable, decode, encode, message_dtype
+from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.simulate.frames import STRINGS
-from eskf_ros.simulate.map_frame import MapFrame
 from eskf_ros.simulate.messages import topics_of
 from eskf_ros.simulate.scenario import Recording
 

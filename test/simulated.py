@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from eskf_ros.bags import open_bag
+from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.simulate.gnss import GnssMeasurements
 from eskf_ros.simulate.imu import ImuMount, ideal_samples
-from eskf_ros.simulate.map_frame import MapFrame
 from eskf_ros.simulate.motion import Motion, Trajectory
 from eskf_ros.simulate.scenario import DATUM, START_STAMP, trajectory
 

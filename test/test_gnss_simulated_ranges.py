@@ -15,6 +15,7 @@ from simulated import TOPICS, assert_chi_square, seconds
 
 from eskf_ros.bags import POINT_CLOUD, open_bag
 from eskf_ros.earth import ecef_to_geodetic
+from eskf_ros.geodesy.map_frame import east_north_up_to_ecef
 from eskf_ros.gnss import time as gnss_time
 from eskf_ros.gnss.cloud import read_epoch
 from eskf_ros.gnss.ephemeris import Ephemerides
@@ -29,7 +30,6 @@ from eskf_ros.gnss.weighting import DEFAULT_WEIGHTING
 from eskf_ros.simulate import constellation
 from eskf_ros.simulate.episodes import Outage
 from eskf_ros.simulate.main import main
-from eskf_ros.simulate.map_frame import east_north_up_to_ecef
 from eskf_ros.simulate.range_episodes import ClockStep, KeepSatellites, Reflections, StreetCanyon
 from eskf_ros.simulate.range_receiver import MILLISECOND, RangeMeasurements, RangeReceiver
 from eskf_ros.simulate.scenario import Recording, simulate, trajectory

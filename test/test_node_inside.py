@@ -15,9 +15,9 @@ from ros_process import free_domain, needs_ros
 from eskf_ros.bags import StringTable, decode, encode
 from eskf_ros.filter.layout import Status, Stream
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.node.trouble import FRESH, KINDS, Trouble
 from eskf_ros.parameters import load
-from eskf_ros.simulate.map_frame import MapFrame
 
 SECOND = 1_000_000_000
 FIX, TWIST, IMU = "sensor_msgs/msg/NavSatFix", "geometry_msgs/msg/TwistWithCovarianceStamped", "sensor_msgs/msg/Imu"

@@ -18,9 +18,9 @@ from ros_process import Ros, needs_ros
 from scipy.spatial.transform import Rotation
 
 from eskf_ros.filter.warm_start import Memory
+from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.node.memory import read_memory, write_memory
 from eskf_ros.parameters import load
-from eskf_ros.simulate.map_frame import MapFrame
 from eskf_ros.simulate.scenario import simulate
 
 pytestmark = needs_ros

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from ros_process import Ros, free_domain, needs_ros
 
 import eskf_ros
-from eskf_ros.compiled import COMPILED
+from eskf_ros.compiled import COMPILED, sentence_on_compiling
 from eskf_ros.filter.layout import ODOMETRY, allocate
 from eskf_ros.node.cdr import ImuReader, LayoutError, OdometryMessageWriter, OdometryWriter, imu_from_message
 from eskf_ros.node.clocks import Stamp, StampMonitor, clock_complaints
@@ -859,6 +859,35 @@ def test_compiling_is_told_and_loading_from_the_cache_is_not(tmp_path: Path) -> 
     for expected in ("[1, 2]\n", "[]\n"):
         command = [sys.executable, str(script)]
         assert subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout == expected
+
+
+def test_compiling_says_so_at_once_and_then_seldom() -> None:
+    said: list[str] = []
+    tell = sentence_on_compiling(said.append)
+    for count in range(1, 100):
+        tell(count)
+    assert len(said) == 1
+    assert said[0].startswith("compiling the estimator: 1 functions in 0 s, about 0 %")
+
+
+@pytest.mark.skipif(not COMPILED, reason="the kernels run uncompiled here")
+def test_the_command_compiles_without_ros_and_says_where() -> None:
+    code = (
+        "import sys; sys.modules['rclpy'] = None; from eskf_ros.node.main import main; status = main(['--compile']); "
+        "from eskf_ros.compiled import CACHE_FOLDER; print(CACHE_FOLDER); sys.exit(status)"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    *_, said, folder = ended.stdout.splitlines()
+    assert said == f"eskf_node: compiled; the machine code is in {folder}"
+    assert list(Path(folder).rglob("*.nbc"))
+
+
+def test_without_numba_there_is_nothing_to_compile() -> None:
+    code = "import sys; from eskf_ros.node.main import main; sys.exit(main(['--compile']))"
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    ended = subprocess.run([sys.executable, "-c", code], env=environment, check=False, capture_output=True, text=True)
+    assert ended.returncode == 2
+    assert "nothing to compile" in ended.stderr
 
 
 def test_catching_signals_costs_no_import_of_ros() -> None:

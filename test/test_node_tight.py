@@ -18,10 +18,10 @@ from test_node_inside import Drive, Inside
 from eskf_ros.bags import POINT_CLOUD, StringTable, cloud_messages, decode, encode, open_bag
 from eskf_ros.filter.aiding.signal import satellite_of
 from eskf_ros.filter.layout import Verdict
+from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.replay.main import main as replay
 from eskf_ros.replay.summary import final_result
 from eskf_ros.simulate.main import main as simulate
-from eskf_ros.simulate.map_frame import MapFrame
 
 SECOND = 1_000_000_000
 TYPES = {"imu/data": "sensor_msgs/msg/Imu", "gnss/ranges": POINT_CLOUD, "gnss/ephemerides": POINT_CLOUD}

@@ -219,3 +219,18 @@ def test_run_without_a_verb_explains_itself() -> None:
     assert result.returncode == 2
     assert "./run demo" in result.stdout
     assert "./run test" in result.stdout
+
+
+def test_only_the_simulator_imports_the_simulator():
+    """A robot needs none of it: what node and replay share with it stands elsewhere."""
+    package = Path(eskf_ros.__file__).parent
+    importers = []
+    for source in sorted(package.rglob("*.py")):
+        if source.is_relative_to(package / "simulate"):
+            continue
+        for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
+            names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if any(name.startswith("eskf_ros.simulate") for name in names):
+                importers.append(source.relative_to(package).as_posix())
+    assert not importers

@@ -407,8 +407,8 @@ def test_truth_as_fixes_of_the_antenna_and_in_the_map(tmp_path: Path, recording:
 def test_the_covariance_of_the_truth_counts() -> None:
     """e' (P + R)^-1 e by hand: P = 9, R = 16 and an error of 5 m east give 25 / 25."""
     from eskf_ros.filter.layout import ODOMETRY
+    from eskf_ros.geodesy.map_frame import MapFrame
     from eskf_ros.replay.truth import EPOCH, compare
-    from eskf_ros.simulate.map_frame import MapFrame
 
     row, epoch = np.zeros(1, ODOMETRY), np.zeros(1, EPOCH)
     row["attitude_body_to_map"][:, 0] = 1.0

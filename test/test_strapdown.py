@@ -16,8 +16,8 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 from eskf_ros.filter.strapdown import LONGEST_STEP, SECOND, gravity_map, step
+from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.simulate.imu import ideal_samples
-from eskf_ros.simulate.map_frame import MapFrame
 from eskf_ros.simulate.scenario import DATUM, trajectory
 
 Array = NDArray[np.float64]

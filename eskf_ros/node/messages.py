@@ -13,8 +13,8 @@ from sensor_msgs.msg import NavSatFix, NavSatStatus
 
 from eskf_ros.filter.aiding.signal import name_of
 from eskf_ros.filter.layout import STREAM_NAMES, Stream, Verdict
+from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.gnss.point_solution import PointSolution, SolutionStatus
-from eskf_ros.simulate.map_frame import MapFrame
 
 SECOND = 1_000_000_000
 

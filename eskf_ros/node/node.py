@@ -20,9 +20,9 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
 
-from eskf_ros.compiled import while_compiling
-from eskf_ros.filter.layout import ODOMETRY, STREAM_NAMES, Status, Stream, Verdict, allocate
-from eskf_ros.filter.navigator import ORIENTATION_SHARE, Navigator, compile_kernels
+from eskf_ros.compiled import sentence_on_compiling, while_compiling
+from eskf_ros.filter.layout import STREAM_NAMES, Status, Stream, Verdict
+from eskf_ros.filter.navigator import ORIENTATION_SHARE, Navigator
 from eskf_ros.filter.warm_start import Memory
 from eskf_ros.gnss.rinex import RinexError
 from eskf_ros.inputs import Input, uses_ranges
@@ -34,19 +34,18 @@ from eskf_ros.node.extrinsics import IMU, Extrinsics, place_of
 from eskf_ros.node.inputs import AidInput, open_inputs
 from eskf_ros.node.memory import read_memory, write_memory
 from eskf_ros.node.messages import bias_message, fix_message, record_statuses, solution_message
-from eskf_ros.node.odometry import NUMBERS, fill_odometry
 from eskf_ros.node.outputs import OUTPUT_QOS, OVERRIDING, Outputs
 from eskf_ros.node.poses import set_pose
 from eskf_ros.node.status import status_report
 from eskf_ros.node.trouble import Trouble
+from eskf_ros.node.warm_up import compile_node
 from eskf_ros.parameters import ParameterError, Parameters
-from eskf_ros.ranges.intake import RangeIntake, compile_ranges
+from eskf_ros.ranges.intake import RangeIntake
 
 INPUT_DEPTH = 1000
 """A second of a fast IMU: what may wait while the computer is busy elsewhere."""
 
 REPORT_PERIOD = 1.0
-PROGRESS_PERIOD = 5.0
 """Seconds from one report to the next, and from one word about compiling to the next."""
 
 WATCH_EVERY = 10
@@ -141,20 +140,8 @@ class EskfNode(Node):
         """Have every kernel compiled before the first message comes: from the cache, or anew for a minute."""
         log = self.get_logger().info
         log("starting the estimator; the first start after an installation compiles it, which takes a minute")
-        started = told = time.monotonic()
-
-        def tell(count: int) -> None:
-            nonlocal told
-            if time.monotonic() - told > PROGRESS_PERIOD:
-                told = time.monotonic()
-                log(f"compiling the estimator: {count} functions in {told - started:.0f} s")
-
-        with while_compiling(tell):
-            compile_kernels()
-            if uses_ranges(self.parameters):
-                compile_ranges(self.parameters)
-            fill_odometry(allocate(ODOMETRY), 0, False, np.zeros((2, NUMBERS)))
-            fix_message(self.navigator.odometry[0], (0.0, 0.0, 0.0), "")
+        with while_compiling(sentence_on_compiling(log)):
+            compile_node(self.parameters, uses_ranges(self.parameters))
 
     def _publisher(self, kind: Any, topic: str) -> Any:
         return self.create_publisher(kind, topic, OUTPUT_QOS, qos_overriding_options=OVERRIDING)

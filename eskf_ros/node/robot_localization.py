@@ -13,8 +13,8 @@ import numpy as np
 from rclpy.node import Node
 
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.node.poses import set_pose
-from eskf_ros.simulate.map_frame import MapFrame
 
 try:
     from robot_localization import srv as services

@@ -252,17 +252,24 @@ def _replay(bag: Path, folder: Path, parameters: Parameters, options: argparse.N
 
 @contextmanager
 def _progress(bag: Path, quiet: bool) -> Iterator[Callable[[float], None]]:
-    """A progress bar on the terminal, if there is one."""
-    if quiet or not sys.stderr.isatty():
+    """A progress bar on the terminal, if there is one; what is compiled first is told in any case."""
+    if quiet:
         yield lambda share: None
+        return
+    from eskf_ros.compiled import sentence_on_compiling, while_compiling
+
+    if not sys.stderr.isatty():
+        with while_compiling(sentence_on_compiling(_say)):
+            yield lambda share: None
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("starting; the first start after an installation compiles the estimator", total=1.0)
-        yield lambda share: bar.update(task, description=bag.name, completed=share)
+        task = bar.add_task("starting", total=1.0)
+        with while_compiling(sentence_on_compiling(lambda text: bar.update(task, description=text))):
+            yield lambda share: bar.update(task, description=bag.name, completed=share)
 
 
 def _write_json(target: str, content: Any) -> None:

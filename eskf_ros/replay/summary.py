@@ -30,13 +30,13 @@ from numpy.typing import NDArray
 
 from eskf_ros.filter.layout import STREAM_NAMES, Status, Stream, Verdict
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.geodesy.map_frame import MapFrame, east_north_up_to_ecef, to_geodetic
 from eskf_ros.inputs import Input
 from eskf_ros.parameters import Parameters
 from eskf_ros.ranges.intake import RangeIntake
 from eskf_ros.replay.feed import Feed
 from eskf_ros.replay.topics import TopicNames
 from eskf_ros.replay.truth import rotation_matrices
-from eskf_ros.simulate.map_frame import MapFrame, east_north_up_to_ecef, to_geodetic
 
 CHI_SQUARE_95 = np.array([math.nan, 3.841458820694124, 5.991464547107979, 7.814727903251179])
 """95 % quantile of chi-square by degrees of freedom: `in_95` is the share of values not above it."""

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from eskf_ros.bags import BagReader, Batch
 from eskf_ros.filter.layout import Stream
+from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.inputs import FIX, ODOMETRY, RANGES, TWIST, Input, inputs_of, uses_ranges
 from eskf_ros.parameters import Parameters, Topics
 from eskf_ros.replay.truth import epochs_from_fix, epochs_from_odometry
-from eskf_ros.simulate.map_frame import MapFrame
 
 IMU = "sensor_msgs/msg/Imu"
 

@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from eskf_ros.geodesy.map_frame import east_north_up_to_ecef, to_geodetic
 from eskf_ros.simulate.episodes import Episode, received
 from eskf_ros.simulate.gnss_episodes import GnssEpisode, GnssReport
-from eskf_ros.simulate.map_frame import east_north_up_to_ecef, to_geodetic
 from eskf_ros.simulate.motion import Vector
 from eskf_ros.simulate.sampling import Interval, Section, Stamps, arrivals, check_rate, generators
 

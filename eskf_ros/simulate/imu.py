@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.simulate.map_frame import MapFrame
+from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.simulate.motion import Trajectory, Vector, cross, mounting
 from eskf_ros.simulate.sampling import generators
 

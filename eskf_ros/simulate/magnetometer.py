@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from eskf_ros.geodesy.map_frame import east_north_up_to_ecef, to_geodetic
 from eskf_ros.simulate.episodes import Episode, MagneticDisturbance
-from eskf_ros.simulate.map_frame import east_north_up_to_ecef, to_geodetic
 from eskf_ros.simulate.motion import Vector, mounting
 from eskf_ros.simulate.sampling import Interval, Section, Stamps, arrivals, check_rate, generators
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.simulate.barometer import Barometer, BarometerMeasurements
 from eskf_ros.simulate.body_velocity import BodyVelocity, BodyVelocityMeasurements
 from eskf_ros.simulate.dual_antenna import DualAntenna, DualAntennaMeasurements
@@ -26,7 +27,6 @@ from eskf_ros.simulate.gnss_episodes import (
 )
 from eskf_ros.simulate.imu import grade_parameters
 from eskf_ros.simulate.magnetometer import Magnetometer, MagnetometerMeasurements
-from eskf_ros.simulate.map_frame import MapFrame
 from eskf_ros.simulate.motion import Vector
 from eskf_ros.simulate.range_episodes import RANGE_EPISODES
 from eskf_ros.simulate.range_receiver import RangeMeasurements, RangeReceiver

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.simulate.map_frame import MapFrame
+from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.simulate.motion import Motion, Trajectory
 
 Array = NDArray[np.float64]

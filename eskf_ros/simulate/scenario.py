@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.simulate.episodes import Outage, outages_of
 from eskf_ros.simulate.gnss import GnssStreams
 from eskf_ros.simulate.imu import (
@@ -23,7 +24,6 @@ from eskf_ros.simulate.imu import (
     ideal_samples,
     vibration,
 )
-from eskf_ros.simulate.map_frame import MapFrame
 from eskf_ros.simulate.recording import AIDS, Options, Recording
 from eskf_ros.simulate.sampling import (
     START_STAMP,

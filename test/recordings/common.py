@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from eskf_ros import earth
 from eskf_ros.bags import BagWriter, message_dtype
+from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.replay.main import main
-from eskf_ros.simulate.map_frame import MapFrame
 
 Array = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.simulate.map_frame import MapFrame
+from eskf_ros.geodesy.map_frame import MapFrame
 from recordings.common import Array, Recording
 
 INSTALLATION = """\

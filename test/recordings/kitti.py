@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.simulate.map_frame import MapFrame, to_geodetic
+from eskf_ros.geodesy.map_frame import MapFrame, to_geodetic
 from recordings.common import (
     GNSS_LATENCY,
     STATUS_FIX,

@@ -21,11 +21,11 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
+from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.gnss.ephemeris import Ephemerides
 from eskf_ros.gnss.signals import Gnss
 from eskf_ros.simulate.episodes import Episode
 from eskf_ros.simulate.imu import SensorErrors, grade_parameters, ideal_samples
-from eskf_ros.simulate.map_frame import MapFrame
 from eskf_ros.simulate.motion import Motion, checked_times
 from eskf_ros.simulate.range_episodes import StreetCanyon
 from eskf_ros.simulate.range_receiver import RangeReceiver

@@ -26,7 +26,7 @@ from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 
 from eskf_ros import earth
-from eskf_ros.simulate.map_frame import east_north_up_to_ecef
+from eskf_ros.geodesy.map_frame import east_north_up_to_ecef
 from recordings.common import (
     STATUS_FIX,
     Array,

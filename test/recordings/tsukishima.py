@@ -35,6 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.io import loadmat
 
+from eskf_ros.geodesy.map_frame import east_north_up_to_ecef
 from eskf_ros.gnss.ephemeris import Ephemerides
 from eskf_ros.gnss.ranges import (
     ALREADY_TURNED,
@@ -48,7 +49,6 @@ from eskf_ros.gnss.ranges import (
 )
 from eskf_ros.gnss.rinex_nav import read_navigation
 from eskf_ros.gnss.signals import L1, SIGNAL_BY_CODE, SPEED_OF_LIGHT, Gnss
-from eskf_ros.simulate.map_frame import east_north_up_to_ecef
 from recordings.common import (
     GNSS_LATENCY,
     STATUS_GBAS,
