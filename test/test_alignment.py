@@ -231,7 +231,7 @@ def test_heading_is_that_of_base_link_with_any_mount(seed: int, heading_deg: flo
         math.remainder(math.radians(40.0 * seed), 2.0 * math.pi), abs=1e-12
     )
     before = copy_of(state)
-    heading_start.set_heading(state, math.radians(heading_deg), 0.1, settings)
+    heading_start.reset_heading(state, math.radians(heading_deg), 0.1, settings)
     expected = Rotation.from_euler("xyz", [4.0, -7.0, heading_deg], degrees=True)
     turned = to_rotation(state["attitude"]) * mount.inv()
     # The plumb line at the datum's altitude leans against map's z by a microradian.
@@ -252,7 +252,7 @@ def test_set_heading_turns_the_tilt_error_with_the_attitude(seed: int) -> None:
     truth = Rotation.from_rotvec(theta) * to_rotation(state["attitude"])
     np.testing.assert_allclose(tilt_error(state, truth), theta, rtol=0.0, atol=5e-6)
     std = 0.05
-    heading_start.set_heading(state, 2.0, std, settings)
+    heading_start.reset_heading(state, 2.0, std, settings)
     turn = to_rotation(state["attitude"]) * to_rotation(before["attitude"]).inv()
     # What is true has not moved: its tilt, seen from the new attitude, has.
     np.testing.assert_allclose(tilt_error(state, truth), turn.apply(theta), rtol=0.0, atol=5e-6)
@@ -384,7 +384,7 @@ def watch(state: Any, settings: Any, seconds: float, force: Any, rate: Any, shak
         state["stamp"] += 10_000_000
         state["specific_force"] = np.array(force) + (shaking * math.sin(0.9 * k), 0.0, 0.0)
         state["angular_rate"] = rate
-        still_window.watch_stillness(state, settings)
+        still_window.update_static_window(state, settings)
 
 
 def waiting() -> Any:
@@ -495,7 +495,7 @@ def distrusting(robots: int, std: float, speed: float = 0.0) -> int:
             longitude = math.radians(DATUM[1]) + east / (6.378e6 * math.cos(latitude))
             aid["stamp"] = round(seconds * 1e9)
             aid["payload"][:9] = (latitude, longitude, DATUM[2] + up, std**2, 0.0, 0.0, std**2, 0.0, std**2)
-            still_window.note_position(state, aid, settings)
+            still_window.update_evidence_from_fix(state, aid, settings)
             if state["motion_stamp"] > 0 and state["still_stamp"] == NEVER:
                 found += 1
                 break
@@ -525,7 +525,7 @@ def test_first_fix_starts_the_position() -> None:
     attitude = Rotation.from_euler("xyz", [0.3, -0.2, 0.0])
     level_with(state, *at_rest(state, attitude, np.zeros(3), np.zeros(3)), settings)
     payload = np.array([math.radians(48.0), math.radians(11.0), 500.0, 1.0, 0.0, 0.0, 1.0, 0.0, 4.0])
-    alignment.start_position(state, payload)
+    alignment.reset_position_to_fix(state, payload)
     assert (state["datum_known"], state["position_known"]) == (1, 1)
     np.testing.assert_array_equal(state["datum"], payload[:3])
     np.testing.assert_allclose(state["position_map"], 0.0, atol=1e-9)
@@ -545,7 +545,7 @@ def test_far_datum_levels_along_the_local_vertical() -> None:
     force = attitude.inv().apply([0.0, 0.0, 9.81])
     level_with(state, force, np.zeros(3), settings)
     payload = np.array([math.radians(52.5), math.radians(11.0), 80.0, 1.0, 0.0, 0.0, 1.0, 0.0, 4.0])
-    alignment.start_position(state, payload)
+    alignment.reset_position_to_fix(state, payload)
     up = np.array(local_frame.local_up(state))
     assert math.degrees(math.acos(up[2])) == pytest.approx(4.5, abs=0.02)
     measured_up = to_rotation(state["attitude"]).apply(force / 9.81)

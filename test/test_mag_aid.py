@@ -149,7 +149,7 @@ def test_the_error_changes_with_the_way_and_keeps_its_variance(way: tuple[float,
     state["covariance"][ERROR, 0] = state["covariance"][0, ERROR] = 0.01
     before = float(state["optional"][ERROR - ERROR_SIZE])
     state["position_map"][0] += way[0]
-    mag.note_way(state, math.remainder(3.1 + way[1], math.tau), SETTINGS)
+    mag.propagate_mag_error(state, math.remainder(3.1 + way[1], math.tau), SETTINGS)
     length = way[0] / SETTINGS["mag_error_distance"] + way[1]
     remaining = math.exp(-length) if length > 0.2 else 1.0
     assert state["optional"][ERROR - ERROR_SIZE] == pytest.approx(before * remaining)

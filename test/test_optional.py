@@ -19,7 +19,7 @@ from eskf_ros.filter import optional
 from eskf_ros.filter.aiding import gnss_position
 from eskf_ros.filter.layout import AID, ERROR_SIZE, NOWHERE, Stream, Verdict, allocate
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.filter.recovery import watch_solution
+from eskf_ros.filter.recovery import reset_for_new_solution
 from eskf_ros.filter.strapdown import step
 from eskf_ros.filter.update import update
 from eskf_ros.parameters import from_mapping
@@ -116,7 +116,7 @@ def test_what_lasts_keeps_its_variance_and_forgets_in_its_time() -> None:
     # How it starts shows in what it has in common with the position.
     state["covariance"][0, 15] = state["covariance"][15, 0] = 0.5
     for _ in range(round(TIME / 0.02)):
-        optional.wander(state, 0.02, LASTING)
+        optional.propagate_augmented(state, 0.02, LASTING)
     np.testing.assert_allclose(np.diag(state["covariance"])[15:18], 1.0, rtol=1e-3)
     assert state["covariance"][0, 15] == pytest.approx(0.5 * math.exp(-1.0), rel=1e-3)
 
@@ -178,14 +178,14 @@ def fix_with_std(std: float) -> Any:
 def test_another_kind_of_solution_has_another_error(std: float, renewed: bool) -> None:
     state = joined(3)
     state["last_fix_variance"] = 2.0
-    watch_solution(state, fix_with_std(std), LASTING)
+    reset_for_new_solution(state, fix_with_std(std), LASTING)
     assert (state["covariance"][PLACE, :3] == 0.0).all() == renewed
     assert (state["optional"][:3] == 0.0).all() == renewed
     if renewed:
         np.testing.assert_array_equal(state["covariance"][PLACE:SIZE, :SIZE], np.eye(3, SIZE, PLACE))
     # From now on that is its kind.
     after = copy_of(state)
-    watch_solution(state, fix_with_std(std), LASTING)
+    reset_for_new_solution(state, fix_with_std(std), LASTING)
     assert state.tobytes() == after.tobytes()
 
 

@@ -271,7 +271,7 @@ def test_clock_between_epochs(steps: int) -> None:
     state["optional"][CLOCK - ERROR_SIZE : size - ERROR_SIZE] = 100.0, -7.0
     before = copy_of(state)
     for _ in range(steps):
-        optional.wander(state, time / steps, settings)
+        optional.propagate_augmented(state, time / steps, settings)
     transition = np.eye(size)
     transition[CLOCK, CLOCK + 1] = time
     expected = transition @ before["covariance"][:size, :size] @ transition.T

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from eskf_ros.filter.layout import AID, CONSTRAINT_INTERVAL, NEVER, RECORD, Stream, Verdict, allocate
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.filter.stillness import learn_from_block, note_evidence
+from eskf_ros.filter.stillness import learn_from_block, update_rest_evidence
 from eskf_ros.filter.update import update
 from eskf_ros.parameters import from_mapping
 from eskf_ros.simulate.imu import vibration
@@ -86,7 +86,7 @@ def offered(stream: Stream, stamp: int, values: Any, stds: Any) -> Any:
 )
 def test_what_one_message_says(stream: Stream, values: Any, stds: Any, says: str) -> None:
     state = make_state()
-    note_evidence(state, offered(stream, 7 * SECOND, values, stds), SETTINGS)
+    update_rest_evidence(state, offered(stream, 7 * SECOND, values, stds), SETTINGS)
     assert state["resting_stamp"] == (7 * SECOND if says == "rest" else NEVER)
     assert state["moving_stamp"] == (7 * SECOND if says == "motion" else NEVER)
 
@@ -114,7 +114,9 @@ def test_fixes_tell_rest_from_motion_as_soon_as_they_can(std: float, speed: floa
     start = SECOND
     for elapsed in (0.0, seconds):
         stamp = start + round(elapsed * SECOND)
-        note_evidence(state, offered(Stream.GNSS_POSITION, stamp, place(speed * elapsed), (std, std, std)), SETTINGS)
+        update_rest_evidence(
+            state, offered(Stream.GNSS_POSITION, stamp, place(speed * elapsed), (std, std, std)), SETTINGS
+        )
     assert (state["resting_stamp"] > NEVER) == (says == "rest")
     assert (state["moving_stamp"] > NEVER) == (says == "motion")
 
@@ -125,7 +127,9 @@ def test_pressure_that_changes_is_motion(climb: float, moves: bool) -> None:
     state["quiet"] = 1
     for second, height in ((1, 0.0), (9, climb)):
         pressure = 95_000.0 - 11.8 * height
-        note_evidence(state, offered(Stream.BARO, second * SECOND, (pressure, 0.0, 0.0), (5.0, -1.0, -1.0)), SETTINGS)
+        update_rest_evidence(
+            state, offered(Stream.BARO, second * SECOND, (pressure, 0.0, 0.0), (5.0, -1.0, -1.0)), SETTINGS
+        )
     assert (state["moving_stamp"] > NEVER) == moves
 
 

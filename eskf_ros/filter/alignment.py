@@ -13,7 +13,7 @@ from __future__ import annotations
 from eskf_ros.compiled import njit
 from eskf_ros.filter.aiding.gnss_position import position_of_fix
 from eskf_ros.filter.heading_search import forget_search
-from eskf_ros.filter.heading_start import set_heading
+from eskf_ros.filter.heading_start import reset_heading
 from eskf_ros.filter.layout import ERROR_CAPACITY, NEVER, POSITION, VELOCITY
 from eskf_ros.filter.local_frame import local_up, set_datum, shortest_turn, turn_attitude
 from eskf_ros.filter.track import forget_tracks
@@ -52,7 +52,7 @@ def restart(state):
 
 
 @njit
-def start_position(state, payload):
+def reset_position_to_fix(state, payload):
     """Take position from the first fix, with a wide prior that the update of this same fix makes narrow."""
     old_up = local_up(state)
     if state.datum_known == 0:
@@ -91,7 +91,7 @@ def place(state, position, position_covariance, heading, heading_std, settings):
     state.position_known = 0
     forget_search(state)
     forget_tracks(state)
-    set_heading(state, heading, heading_std, settings)
+    reset_heading(state, heading, heading_std, settings)
     m = settings.imu_position_base
     offset = rotate(to_matrix(state.attitude), rotate_back(settings.imu_to_base, (m[0], m[1], m[2])))
     for i in range(3):

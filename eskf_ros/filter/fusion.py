@@ -16,18 +16,18 @@ from eskf_ros.filter.aiding import (
     zaru,
     zupt,
 )
-from eskf_ros.filter.alignment import start_position
-from eskf_ros.filter.heading_hints import is_heading_told
-from eskf_ros.filter.heading_start import heading_of, recall_heading, search_heading
+from eskf_ros.filter.alignment import reset_position_to_fix
+from eskf_ros.filter.heading_hints import update_unknown_heading
+from eskf_ros.filter.heading_start import heading_of, reset_heading_from_memory, search_heading
 from eskf_ros.filter.layout import CONSTRAINTS, Stream, Verdict
 from eskf_ros.filter.local import note_jump
 from eskf_ros.filter.monitors import watch_course, watch_field, watch_heading
 from eskf_ros.filter.optional import join
-from eskf_ros.filter.recovery import gate_of, note, recover, watch_solution
-from eskf_ros.filter.still_window import note_position, note_velocity
-from eskf_ros.filter.stillness import note_evidence, watch_wheels
+from eskf_ros.filter.recovery import gate_of, note, recover, reset_for_new_solution
+from eskf_ros.filter.still_window import update_evidence_from_fix, update_evidence_from_velocity
+from eskf_ros.filter.stillness import update_rest_evidence, watch_wheels
 from eskf_ros.filter.timeline import open_record
-from eskf_ros.filter.track import follow
+from eskf_ros.filter.track import update_track
 from eskf_ros.filter.update import update
 from eskf_ros.filter.wheel_heading import search_with_wheels
 
@@ -58,7 +58,7 @@ def fuse(state, aids, i, settings, work):
     if not open_record(aids, i):
         return
     aid = aids[i]
-    take_evidence(state, aid, settings)
+    update_motion_evidence(state, aid, settings)
     if aid.stream == GNSS_POSITION and state.level_known == 1 and state.position_known == 0:
         begin(state, aid, settings)
     position_before = (state.position_map[0], state.position_map[1], state.position_map[2])
@@ -78,11 +78,11 @@ def offer(state, aid, heading_before, settings, work):
         aid.verdict = INACTIVE
         return
     join(state, settings.reach[aid.stream], settings)
-    watch_solution(state, aid, settings)
+    reset_for_new_solution(state, aid, settings)
     size = measure(state, aid, heading_before, settings, work)
     if size == 0:
         return
-    follow(state, aid, work)
+    update_track(state, aid, work)
     gate = gate_of(state, aid, size, settings)
     aid.verdict, aid.nis = update(state, size, gate, work)
     recover(state, aid, size, gate, settings, work)
@@ -96,14 +96,14 @@ def offer(state, aid, heading_before, settings, work):
 
 
 @njit
-def take_evidence(state, aid, settings):
+def update_motion_evidence(state, aid, settings):
     """Note what a measurement says of place, course, motion and rest: that counts whatever becomes of it."""
     if aid.stream == GNSS_POSITION:
-        note_position(state, aid, settings)
+        update_evidence_from_fix(state, aid, settings)
     elif aid.stream == GNSS_VELOCITY:
-        note_velocity(state, aid, settings)
+        update_evidence_from_velocity(state, aid, settings)
         watch_course(state, aid, heading_of(state, settings), settings)
-    note_evidence(state, aid, settings)
+    update_rest_evidence(state, aid, settings)
 
 
 @njit
@@ -120,8 +120,8 @@ def begin(state, aid, settings):
     """Take the position from the first fix, and the heading from memory if the robot is where it was left."""
     position = (state.position_map[0], state.position_map[1], state.position_map[2])
     heading_before = heading_of(state, settings)
-    start_position(state, aid.payload)
-    recall_heading(state, aid.payload, settings)
+    reset_position_to_fix(state, aid.payload)
+    reset_heading_from_memory(state, aid.payload, settings)
     note_jump(state, position, heading_before, settings)
 
 
@@ -132,8 +132,8 @@ def measure(state, aid, heading_before, settings, work):
     A heading is what the first of those that tell it makes known: the measurement is linearized anew there.
     """
     if aid.stream == MAG:
-        mag.note_way(state, heading_before, settings)
-        is_disturbed = mag.is_disturbed(state, aid, settings)
+        mag.propagate_mag_error(state, heading_before, settings)
+        is_disturbed = mag.update_disturbance(state, aid, settings)
         watch_field(state, is_disturbed)
         if is_disturbed:
             aid.verdict = GATE
@@ -149,7 +149,7 @@ def measure(state, aid, heading_before, settings, work):
     if aid.stream in (HEADING, MAG):
         watch_heading(state, aid, work)
         if state.heading_known == 0:
-            if not is_heading_told(state, aid, settings, work):
+            if not update_unknown_heading(state, aid, settings, work):
                 aid.verdict = BEFORE_ALIGNMENT
                 return 0
             size = linearize(state, aid, settings, work)

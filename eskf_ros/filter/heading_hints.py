@@ -12,7 +12,7 @@ import math
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment import START_VELOCITY_STD, restart
 from eskf_ros.filter.heading_search import turn_found
-from eskf_ros.filter.heading_start import heading_of, set_heading
+from eskf_ros.filter.heading_start import heading_of, reset_heading
 from eskf_ros.filter.layout import ERROR_SIZE, GYRO_BIAS, NEVER, VELOCITY, Stream
 from eskf_ros.rotation import wrapped
 
@@ -43,7 +43,7 @@ OPEN_STD = 1.0
 
 
 @njit
-def is_heading_told(state, aid, settings, work):
+def update_unknown_heading(state, aid, settings, work):
     """Consider a measurement of the unknown heading, described by ``work``; set the heading if it is beyond doubt.
 
     When it returns True the measurement is still to be fused.
@@ -60,19 +60,19 @@ def is_heading_told(state, aid, settings, work):
         std = math.hypot(std, settings.optional_std[settings.heading_offset_at - ERROR_SIZE])
     if rank == MAGNETOMETER:
         std = math.hypot(std, settings.optional_std[settings.mag_error_at - ERROR_SIZE])
-    if std > LARGEST_STD or not do_agree(state, aid.stamp, rank, turn, std, SHORTEST_TIME[rank]):
+    if std > LARGEST_STD or not update_heading_candidate(state, aid.stamp, rank, turn, std, SHORTEST_TIME[rank]):
         return False
     found, found_std = turn_found(state)
     if abs(wrapped(turn - found)) > SIGMAS * math.sqrt(std**2 + found_std**2):
         return False
-    set_heading(state, heading_of(state, settings) + turn, OPEN_STD, settings)
+    reset_heading(state, heading_of(state, settings) + turn, OPEN_STD, settings)
     state.heading_known = 1
     state.mag_heading = heading_of(state, settings)
     return True
 
 
 @njit
-def do_agree(state, stamp, rank, turn, std, shortest_time):
+def update_heading_candidate(state, stamp, rank, turn, std, shortest_time):
     """Say whether enough messages in a row, this one the last, would turn the attitude alike (rad)."""
     age = (stamp - state.hint_stamp) * 1e-9
     if state.hint_count > 0 and rank > state.hint_rank and age < SILENCE:
@@ -95,7 +95,7 @@ def do_agree(state, stamp, rank, turn, std, shortest_time):
 
 
 @njit
-def is_given_heading_refuted(state, aid, settings, work):
+def update_refutation(state, aid, settings, work):
     """Consider a heading of the dual antenna that was rejected; say whether it refutes a heading that was given.
 
     A parameter, a memory or a pose may be wrong, and a filter that trusts them rejects for ever the sensor that knows
@@ -106,13 +106,13 @@ def is_given_heading_refuted(state, aid, settings, work):
     if not is_doubtful or aid.source != 0 or not aid.payload[3] > 0.0:
         return False
     std = math.sqrt(aid.payload[3])
-    if not do_agree(state, aid.stamp, DUAL_ANTENNA, work.innovation[0], std, REFUTING_TIME):
+    if not update_heading_candidate(state, aid.stamp, DUAL_ANTENNA, work.innovation[0], std, REFUTING_TIME):
         return False
     return (state.hint_since - state.given_stamp) * 1e-9 < TRIAL_TIME
 
 
 @njit
-def take_back_heading(state, aid, settings, work):
+def reset_given_heading(state, aid, settings, work):
     """Take the heading of the antennas, if they were believed before, else none: antennas may be swapped, too.
 
     Then only motion decides. The velocity, led astray meanwhile, is open. Returns whether the antennas have won.
@@ -126,7 +126,7 @@ def take_back_heading(state, aid, settings, work):
     std = math.sqrt(aid.payload[3])
     if settings.heading_offset_at < state.error_size:
         std = math.hypot(std, settings.optional_std[settings.heading_offset_at - ERROR_SIZE])
-    set_heading(state, heading_of(state, settings) + work.innovation[0], std, settings)
+    reset_heading(state, heading_of(state, settings) + work.innovation[0], std, settings)
     for i in range(VELOCITY, VELOCITY + 3):
         for j in range(len(state.covariance)):
             state.covariance[i, j] = 0.0

@@ -38,7 +38,7 @@ def heading_of(state, settings):
 
 
 @njit
-def set_heading(state, heading, std, settings):
+def reset_heading(state, heading, std, settings):
     """Turn the attitude about the local vertical to ``heading`` (rad), independent of everything else by ``std``."""
     up = local_up(state)
     lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[0])
@@ -98,7 +98,7 @@ def search_with(state, first, measured, lever, gate, settings, work):
         begin_search(state, measured[0], measured[1], max(work.noise[0, 0], work.noise[1, 1]) + reach)
     turn, std = turn_found(state)
     if std <= settings.found_heading_std:
-        set_heading(state, heading_of(state, settings) + turn, std, settings)
+        reset_heading(state, heading_of(state, settings) + turn, std, settings)
         state.heading_known = 1
     elif settings.use_course == 1:
         align_to_course(state, settings)
@@ -145,12 +145,12 @@ def align_to_course(state, settings):
         return
     if ahead < 0.0:
         heading += math.pi
-    set_heading(state, heading, course_std, settings)
+    reset_heading(state, heading, course_std, settings)
     state.heading_known = 1
 
 
 @njit
-def recall_heading(state, payload, settings):
+def reset_heading_from_memory(state, payload, settings):
     """Take the remembered heading if the first fix (``payload``: rad, rad, m, covariance) finds the robot in its place.
 
     The state has level and position already.
@@ -168,6 +168,6 @@ def recall_heading(state, payload, settings):
         return
     f = settings.remembered_forward_ecef
     forward = rotate_back(state.map_to_ecef, (f[0], f[1], f[2]))
-    set_heading(state, math.atan2(forward[1], forward[0]), settings.remembered_heading_std, settings)
+    reset_heading(state, math.atan2(forward[1], forward[0]), settings.remembered_heading_std, settings)
     state.heading_known = 1
     state.given_stamp = state.stamp

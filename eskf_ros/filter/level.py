@@ -7,7 +7,7 @@ import math
 from eskf_ros.compiled import njit
 from eskf_ros.earth import EARTH_RATE, STANDARD_GRAVITY
 from eskf_ros.filter.heading_search import note_level
-from eskf_ros.filter.heading_start import heading_of, set_heading
+from eskf_ros.filter.heading_start import heading_of, reset_heading
 from eskf_ros.filter.layout import ACCEL_BIAS, ATTITUDE, ERROR_CAPACITY, ERROR_SIZE, GYRO_BIAS, NEVER
 from eskf_ros.filter.local_frame import local_up, shortest_turn, turn_attitude
 from eskf_ros.filter.sway import can_be_bias, is_moving, note_sway
@@ -56,12 +56,12 @@ def level(state, sums, count, interval, is_rest, settings):
     up = local_up(state)
     measured = rotate(to_matrix(state.attitude), (force[0] / strength, force[1] / strength, force[2] / strength))
     turn_attitude(state, shortest_turn(measured, up))
-    write_level(state, up, strength, accel_bias, accel_variance, tilt_noise, settings)
-    set_gyro_bias(state, gyro_bias, gyro_variance, rate, up, duration, is_rest, settings)
+    reset_tilt(state, up, strength, accel_bias, accel_variance, tilt_noise, settings)
+    update_gyro_bias_at_rest(state, gyro_bias, gyro_variance, rate, up, duration, is_rest, settings)
     # The parameter is true of the start only, not of where a restart finds the robot.
     if state.level_known == 0 and state.restarts == 0 and not math.isnan(settings.initial_heading):
         state.heading_known = 1
-        set_heading(state, settings.initial_heading, settings.initial_heading_std, settings)
+        reset_heading(state, settings.initial_heading, settings.initial_heading_std, settings)
         state.given_stamp = state.stamp
     state.jump_heading += wrapped(heading_of(state, settings) - heading)
     state.level_known = 1
@@ -118,7 +118,7 @@ def is_level_better_known(state, variance):
 
 
 @njit
-def write_level(state, up, strength, accel_bias, accel_variance, tilt_noise, settings):
+def reset_tilt(state, up, strength, accel_bias, accel_variance, tilt_noise, settings):
     """Write the accelerometer bias, and the covariance of a fresh level.
 
     The accelerometer bias tilts the level, theta = up x (R dba) / g: the cross covariance says so (Groves, section
@@ -163,7 +163,7 @@ def keep_gyro_bias(state):
 
 
 @njit
-def level_again(state, settings):
+def update_level_in_motion(state, settings):
     """Level on the way, at the end of a window, when the gyros have drifted further than such a level is wrong.
 
     Of a robot that is never at rest the gyro bias is not known, and without a heading GNSS tells nothing of the tilt.
@@ -187,7 +187,7 @@ def mean_rate_std(duration, settings):
 
 
 @njit
-def set_gyro_bias(state, prior_bias, prior, mean_rate, up, duration, is_rest, settings):
+def update_gyro_bias_at_rest(state, prior_bias, prior, mean_rate, up, duration, is_rest, settings):
     """Estimate the gyro bias from the mean rate at rest; what is not known of the Earth rate enters its sigma.
 
     The prior (``prior_bias``, rad/s, IMU axes, with variance ``prior``) and the mean are weighed along the vertical
@@ -236,7 +236,7 @@ def set_gyro_bias(state, prior_bias, prior, mean_rate, up, duration, is_rest, se
 
 
 @njit
-def distrust_level(state, settings):
+def reset_level_to_moving(state, settings):
     """Give tilt and gyro bias the uncertainty of a level taken while moving."""
     state.still_stamp = NEVER
     state.still_count = 0

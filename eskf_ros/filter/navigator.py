@@ -37,7 +37,7 @@ from eskf_ros.filter.layout import (
     allocate,
     blank_state,
 )
-from eskf_ros.filter.level import level_again
+from eskf_ros.filter.level import update_level_in_motion
 from eskf_ros.filter.local import carry, measure_step, note_jump
 from eskf_ros.filter.local_frame import move_datum, set_datum
 from eskf_ros.filter.monitors import complaints, is_heading_contradicted
@@ -45,7 +45,7 @@ from eskf_ros.filter.output import status_of, write_odometry
 from eskf_ros.filter.ranges import end_of_epoch, fuse_ranges, is_range, offer_signals
 from eskf_ros.filter.recovery import phase_of
 from eskf_ros.filter.settings import UNKNOWN_ANGLE_VARIANCE, intakes_from, settings_from
-from eskf_ros.filter.still_window import watch_stillness
+from eskf_ros.filter.still_window import update_static_window
 from eskf_ros.filter.stillness import add_to_block
 from eskf_ros.filter.strapdown import SECOND, propagate
 from eskf_ros.filter.sway import add_to_part
@@ -131,8 +131,8 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
         take_sample(state, sample)
         measure_step(state, settings)
         add_to_part(state)
-        watch_stillness(state, settings)
-        level_again(state, settings)
+        update_static_window(state, settings)
+        update_level_in_motion(state, settings)
         add_to_block(state, settings)
         save_checkpoint(states, checkpoints, t)
 

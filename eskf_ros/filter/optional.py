@@ -17,12 +17,12 @@ from eskf_ros.filter.layout import ERROR_SIZE
 def join(state, reach, settings):
     """Take the optional states into use, so that ``reach`` errors are."""
     if reach > state.error_size:
-        renew(state, state.error_size, reach - state.error_size, settings)
+        reset_augmented(state, state.error_size, reach - state.error_size, settings)
         state.error_size = reach
 
 
 @njit
-def renew(state, place, count, settings):
+def reset_augmented(state, place, count, settings):
     """Begin again with ``count`` optional states from ``place``: zero, as uncertain as at first, independent."""
     covariance = state.covariance
     for i in range(place, place + count):
@@ -34,7 +34,7 @@ def renew(state, place, count, settings):
 
 
 @njit
-def wander(state, dt, settings):
+def propagate_augmented(state, dt, settings):
     """Let ``dt`` s pass for the optional states: they decay towards zero and become less certain."""
     covariance = state.covariance
     if settings.clock_at < state.error_size:
@@ -55,7 +55,7 @@ def run_clock(state, place, dt, settings):
     """Let ``dt`` s pass for the receiver's clock: the bias gains what the drift says, and what the drift gains.
 
     Two-state clock (Brown and Hwang, Introduction to Random Signals and Applied Kalman Filtering, section 9.3); the
-    white noise of each of its two states is left to `wander`.
+    white noise of each of its two states is left to `propagate_augmented`.
     """
     covariance = state.covariance
     state.optional[place - ERROR_SIZE] += dt * state.optional[place + 1 - ERROR_SIZE]

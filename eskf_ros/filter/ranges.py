@@ -41,8 +41,8 @@ from eskf_ros.filter.aiding.signal import (
     source_of,
     system_of,
 )
-from eskf_ros.filter.alignment import start_position
-from eskf_ros.filter.heading_start import heading_of, recall_heading, search_with
+from eskf_ros.filter.alignment import reset_position_to_fix
+from eskf_ros.filter.heading_start import heading_of, reset_heading_from_memory, search_with
 from eskf_ros.filter.layout import (
     ERROR_SIZE,
     LARGEST_EPOCH,
@@ -53,9 +53,9 @@ from eskf_ros.filter.layout import (
     Verdict,
 )
 from eskf_ros.filter.local import note_jump
-from eskf_ros.filter.optional import join, renew
+from eskf_ros.filter.optional import join, reset_augmented
 from eskf_ros.filter.recovery import note_epoch
-from eskf_ros.filter.still_window import VELOCITY_SIGMAS, note_place, note_speed
+from eskf_ros.filter.still_window import VELOCITY_SIGMAS, reset_level_when_moving, update_evidence_from_place
 from eskf_ros.filter.stillness import weigh_speed
 from eskf_ros.filter.timeline import offer_aid, open_record
 from eskf_ros.filter.update import invert_positive, project, update
@@ -222,14 +222,14 @@ def offer_epoch(state, aids, first, end, which, settings, work):
         return
     join_offsets(state, aids, first, end, settings)
     gather(state, aids, first, end, settings, work)
-    settle_clock(state, aids, first, end, which, settings, work)
+    reset_or_jump_clock(state, aids, first, end, which, settings, work)
     solved = solve_epoch(work) and spread_of(work) < POOREST_STD
     if solved:
         note_solution(state, aids[first].stamp, which, settings, work)
     if solved and is_wide(state, which):
-        exclude_outliers(aids, work)
+        reject_outliers(aids, work)
     else:
-        judge_majority(state, aids, first, end, which, settings, work)
+        inflate_or_reset_by_majority(state, aids, first, end, which, settings, work)
     fused = 0
     for i in range(first, end):
         if aids[i].verdict == WAITING:
@@ -324,24 +324,24 @@ def median(values, count, work):
 
 
 @njit
-def set_clock(state, which, shift, settings):
+def reset_clock(state, which, shift, settings):
     """Begin again with the bias (``which`` 0, m) or the drift (1, m/s) of the clock, ``shift`` from where it was."""
     place = settings.clock_at + which
     value = state.optional[place - ERROR_SIZE] + shift
-    renew(state, place, 1, settings)
+    reset_augmented(state, place, 1, settings)
     state.optional[place - ERROR_SIZE] = value
     state.clock_known[which] = 1
 
 
 @njit
-def settle_clock(state, aids, first, end, which, settings, work):
+def reset_or_jump_clock(state, aids, first, end, which, settings, work):
     """Give bias or drift a first value, and follow a jump by whole milliseconds."""
     if work.signal_count == 0:
         return
     common = median(work.signal_innovation, work.signal_count, work)
     place = settings.clock_at + which
     if state.clock_known[which] == 0 or state.covariance[place, place] > LOST_CLOCK[which] ** 2:
-        set_clock(state, which, common, settings)
+        reset_clock(state, which, common, settings)
         gather(state, aids, first, end, settings, work)
         return
     jump = round(common / MILLISECOND)
@@ -369,7 +369,7 @@ def outside(work, shift, gate):
 
 
 @njit
-def judge_majority(state, aids, first, end, which, settings, work):
+def inflate_or_reset_by_majority(state, aids, first, end, which, settings, work):
     """Where most satellites contradict the state, it is the state that is wrong: the clock, or position or velocity."""
     count, gate = work.signal_count, settings.gate[aids[first].stream, 1]
     if count < FEWEST_FOR_CLOCK or 2 * outside(work, 0.0, gate) <= count:
@@ -377,7 +377,7 @@ def judge_majority(state, aids, first, end, which, settings, work):
     common = median(work.signal_innovation, count, work)
     apart = outside(work, common, gate)
     if apart == 0 or (count >= FEWEST_TO_JUDGE and 2 * apart <= count):
-        set_clock(state, which, common, settings)
+        reset_clock(state, which, common, settings)
         gather(state, aids, first, end, settings, work)
     elif count >= FEWEST_TO_JUDGE:
         state.range_faults += 1
@@ -400,7 +400,7 @@ def is_wide(state, which):
 
 
 @njit
-def exclude_outliers(aids, work):
+def reject_outliers(aids, work):
     """Refuse the signals that contradict the others: by their residuals, in units of what most of them show."""
     count = work.signal_count
     if count < FEWEST_TO_EXCLUDE:
@@ -510,10 +510,10 @@ def note_solution(state, stamp, which, settings, work):
         offset = rotate(state.map_to_ecef, measured)
         origin = state.origin_ecef
         ecef = (origin[0] + offset[0], origin[1] + offset[1], origin[2] + offset[2])
-        note_place(state, ecef, std, stamp, 0, settings)
+        update_evidence_from_place(state, ecef, std, stamp, 0, settings)
     else:
         speed = math.sqrt(dot(measured, measured))
-        note_speed(state, speed - VELOCITY_SIGMAS * std, stamp, stamp, settings)
+        reset_level_when_moving(state, speed - VELOCITY_SIGMAS * std, stamp, stamp, settings)
         weigh_speed(state, stamp, speed, std, True)
     if state.heading_known == 0:
         for i in range(3):
@@ -582,14 +582,14 @@ def note_coarsely(state, aids, first, end, which, settings, work):
         found, position = locate_coarsely(aids, first, end, work)
         if found:
             std = math.sqrt(max(work.normal[0, 0], work.normal[1, 1], work.normal[2, 2]))
-            note_place(state, position, std, stamp, 0, settings)
+            update_evidence_from_place(state, position, std, stamp, 0, settings)
     elif state.last_fix_stamp[0] != NEVER:
         fix = state.last_fix_ecef[0]
         gather_coarsely(aids, first, end, (fix[0], fix[1], fix[2]), 1, COARSE_STD[1], work)
         if solve_epoch(work):
             step = (work.step[0], work.step[1], work.step[2])
             std = math.sqrt(max(work.normal[0, 0], work.normal[1, 1], work.normal[2, 2]))
-            note_speed(state, math.sqrt(dot(step, step)) - VELOCITY_SIGMAS * std, stamp, stamp, settings)
+            reset_level_when_moving(state, math.sqrt(dot(step, step)) - VELOCITY_SIGMAS * std, stamp, stamp, settings)
 
 
 @njit
@@ -602,11 +602,11 @@ def start(state, aids, first, end, settings, work):
     # Now with atmosphere, weights and the elevation mask.
     for _ in range(2):
         state.datum_known = had_datum
-        start_position(state, ecef_to_geodetic(ecef[0], ecef[1], ecef[2]))
+        reset_position_to_fix(state, ecef_to_geodetic(ecef[0], ecef[1], ecef[2]))
         state.clock_known[0] = 0
         join_offsets(state, aids, first, end, settings)
         gather(state, aids, first, end, settings, work)
-        settle_clock(state, aids, first, end, 0, settings, work)
+        reset_or_jump_clock(state, aids, first, end, 0, settings, work)
         if not solve_epoch(work) or spread_of(work) > POOREST_STD:
             state.position_known = 0
             state.datum_known = had_datum
@@ -616,8 +616,8 @@ def start(state, aids, first, end, settings, work):
         ecef = (antenna[0] + step[0], antenna[1] + step[1], antenna[2] + step[2])
     geodetic = ecef_to_geodetic(ecef[0], ecef[1], ecef[2])
     state.datum_known = had_datum
-    start_position(state, geodetic)
+    reset_position_to_fix(state, geodetic)
     state.clock_known[0] = 0
     variance = max(work.normal[0, 0], work.normal[1, 1], work.normal[2, 2])
     fix = (geodetic[0], geodetic[1], geodetic[2], variance, 0.0, 0.0, variance, 0.0, variance)
-    recall_heading(state, fix, settings)
+    reset_heading_from_memory(state, fix, settings)

@@ -22,7 +22,7 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment import START_VELOCITY_STD, restart
-from eskf_ros.filter.heading_hints import is_given_heading_refuted, take_back_heading
+from eskf_ros.filter.heading_hints import reset_given_heading, update_refutation
 from eskf_ros.filter.layout import (
     ERROR_CAPACITY,
     NEVER,
@@ -34,7 +34,7 @@ from eskf_ros.filter.layout import (
     Stream,
     Verdict,
 )
-from eskf_ros.filter.optional import renew
+from eskf_ros.filter.optional import reset_augmented
 from eskf_ros.filter.track import is_contradicted, is_fusing, is_live, offset_of_track, patience
 from eskf_ros.filter.update import project, update
 
@@ -90,7 +90,7 @@ SAME_SOLUTION = 4.0
 
 
 @njit
-def watch_solution(state, aid, settings):
+def reset_for_new_solution(state, aid, settings):
     """Begin again with what was learnt of the errors of the fixes when the receiver changes its kind of solution."""
     if aid.stream != GNSS_POSITION:
         return
@@ -99,7 +99,7 @@ def watch_solution(state, aid, settings):
     if max(variance, last) > SAME_SOLUTION * min(variance, last):
         state.scatter[aid.source] = 1.0
         if settings.position_error_at < state.error_size and settings.correlated_share > 0.0:
-            renew(state, settings.position_error_at, 3, settings)
+            reset_augmented(state, settings.position_error_at, 3, settings)
     state.last_fix_variance[aid.source] = variance
 
 
@@ -148,14 +148,14 @@ def recover(state, aid, size, gate, settings, work):
         elif aid.nis <= NEAR_GATE * gate:
             update_weighed_down(state, size, aid.nis / gate, work)
             aid.verdict = WEIGHED_DOWN
-    elif stream == HEADING and aid.verdict == GATE and is_given_heading_refuted(state, aid, settings, work):
-        if take_back_heading(state, aid, settings, work):
+    elif stream == HEADING and aid.verdict == GATE and update_refutation(state, aid, settings, work):
+        if reset_given_heading(state, aid, settings, work):
             aid.verdict = RESET
     elif stream == HEADING and aid.verdict == FUSED:
         state.heading_disputed = 0
     is_lasting = state.stamp - state.aid_fused_stamp[stream, source] > REJECTED_PRESSURE
     if stream == BARO and aid.verdict == GATE and is_lasting:
-        renew(state, settings.baro_offset_at, 1, settings)
+        reset_augmented(state, settings.baro_offset_at, 1, settings)
     note(state, stream, source, aid.verdict)
     if stream == GNSS_POSITION and is_lost(state):
         restart(state)
@@ -268,7 +268,7 @@ def reset(state, source, settings, work):
                 covariance[p, v] = state.track_mixed_variance[source, i]
                 covariance[v, p] = state.track_mixed_variance[source, i]
     if settings.position_error_at < state.error_size:
-        renew(state, settings.position_error_at, 3, settings)
+        reset_augmented(state, settings.position_error_at, 3, settings)
     is_recent = state.reset_stamp != NEVER and state.stamp - state.reset_stamp < RESET_HELPS
     state.recent_resets = state.recent_resets + 1 if is_recent else 1
     state.reset_stamp = state.stamp

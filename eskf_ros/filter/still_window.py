@@ -7,7 +7,7 @@ import math
 from eskf_ros.compiled import njit
 from eskf_ros.earth import STANDARD_GRAVITY, geodetic_to_ecef
 from eskf_ros.filter.layout import GYRO_BIAS, NEVER, SOURCES
-from eskf_ros.filter.level import distrust_level, level
+from eskf_ros.filter.level import level, reset_level_to_moving
 from eskf_ros.filter.local_frame import local_up
 from eskf_ros.filter.monitors import watch_input
 from eskf_ros.filter.sway import MOVING_SPEED
@@ -33,7 +33,7 @@ MINIMUM_WINDOW_SAMPLES = 10
 
 
 @njit
-def watch_stillness(state, settings):
+def update_static_window(state, settings):
     """Add the newest IMU sample to the stillness window; at the end of a window level if that is still wanted."""
     if state.first_stamp == NEVER:
         state.first_stamp = state.stamp
@@ -84,37 +84,37 @@ def watch_stillness(state, settings):
 
 
 @njit
-def note_position(state, aid, settings):
+def update_evidence_from_fix(state, aid, settings):
     """Remember a fix, and what it says about motion."""
     fix = geodetic_to_ecef(aid.payload[0], aid.payload[1], aid.payload[2])
     std = math.sqrt(max(aid.payload[3], aid.payload[6], aid.payload[8]))
-    note_place(state, fix, std, aid.stamp, aid.source, settings)
+    update_evidence_from_place(state, fix, std, aid.stamp, aid.source, settings)
 
 
 @njit
-def note_place(state, ecef, std, stamp, source, settings):
+def update_evidence_from_place(state, ecef, std, stamp, source, settings):
     """Remember the place (m) of an antenna, and look how far it is from that before the current stillness window."""
     if NEVER < state.anchor_stamp[source] < stamp:
         a = state.anchor_ecef[source]
         step = (ecef[0] - a[0], ecef[1] - a[1], ecef[2] - a[2])
         seconds = (stamp - state.anchor_stamp[source]) * 1e-9
         speed = (math.sqrt(dot(step, step)) - POSITION_SIGMAS * math.sqrt(2.0) * std) / seconds
-        note_speed(state, speed, state.anchor_stamp[source], stamp, settings)
+        reset_level_when_moving(state, speed, state.anchor_stamp[source], stamp, settings)
     state.last_fix_stamp[source] = stamp
     for i in range(3):
         state.last_fix_ecef[source, i] = ecef[i]
 
 
 @njit
-def note_velocity(state, aid, settings):
+def update_evidence_from_velocity(state, aid, settings):
     """Look at a GNSS velocity."""
     speed = math.sqrt(aid.payload[0] ** 2 + aid.payload[1] ** 2 + aid.payload[2] ** 2)
     std = math.sqrt(max(aid.payload[3], aid.payload[6], aid.payload[8]))
-    note_speed(state, speed - VELOCITY_SIGMAS * std, aid.stamp, aid.stamp, settings)
+    reset_level_when_moving(state, speed - VELOCITY_SIGMAS * std, aid.stamp, aid.stamp, settings)
 
 
 @njit
-def note_speed(state, speed, since, stamp, settings):
+def reset_level_when_moving(state, speed, since, stamp, settings):
     """Take a speed (m/s) that its noise leaves, the mean from ``since`` to ``stamp``, as proof of motion.
 
     If no robot can have gathered that speed since the last window that passed as still, that window was none.
@@ -125,7 +125,7 @@ def note_speed(state, speed, since, stamp, settings):
     state.moving_stamp = stamp
     waiting = state.heading_known == 0 and state.level_known == 1 and state.still_stamp != NEVER
     if waiting and speed > MOVING_SPEED + STRONGEST_START * (stamp - min(since, state.still_stamp)) * 1e-9:
-        distrust_level(state, settings)
+        reset_level_to_moving(state, settings)
 
 
 @njit

@@ -20,7 +20,7 @@ import math
 from eskf_ros.compiled import njit
 from eskf_ros.earth import geodetic_to_ecef
 from eskf_ros.filter.layout import CONSTRAINT_INTERVAL, NEVER, SOURCES, VELOCITY, Stream, Verdict
-from eskf_ros.filter.still_window import note_speed
+from eskf_ros.filter.still_window import reset_level_when_moving
 from eskf_ros.rotation import dot
 
 GNSS_POSITION = int(Stream.GNSS_POSITION)
@@ -215,7 +215,7 @@ def is_resting(state, settings):
 
 
 @njit
-def note_evidence(state, aid, settings):
+def update_rest_evidence(state, aid, settings):
     """Look at a measurement of any sensor for rest or motion, whatever the filter will make of it."""
     p = aid.payload
     if aid.stream == GNSS_POSITION:
@@ -227,14 +227,16 @@ def note_evidence(state, aid, settings):
     elif aid.stream == BODY_VELOCITY:
         speed, std = math.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2), math.sqrt(max(p[3], p[6], p[8]))
         weigh_speed(state, aid.stamp, speed, std, min(p[3], p[6], p[8]) > 0.0)
-        note_speed(state, speed - REST_SIGMAS * std, aid.stamp, aid.stamp, settings)
+        reset_level_when_moving(state, speed - REST_SIGMAS * std, aid.stamp, aid.stamp, settings)
     elif aid.stream == WHEEL:
         if abs(p[0]) < STANDING_SPEED and abs(p[1]) < STANDING_YAW_RATE:
             if p[3] > 0.0:
                 state.resting_stamp = aid.stamp
         else:
             state.moving_stamp = aid.stamp
-            note_speed(state, abs(p[0]) - REST_SIGMAS * math.sqrt(max(p[3], 0.0)), aid.stamp, aid.stamp, settings)
+            reset_level_when_moving(
+                state, abs(p[0]) - REST_SIGMAS * math.sqrt(max(p[3], 0.0)), aid.stamp, aid.stamp, settings
+            )
     elif aid.stream == BARO:
         note_pressure(state, aid)
 

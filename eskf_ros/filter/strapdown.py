@@ -136,7 +136,7 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
     propagate_covariance(state.covariance, size, middle, force, gravity, earth_rate, dt, coupling, work)
     add_noise(state.covariance, velocity_noise, attitude_noise, dt, settings)
     if size > ERROR_SIZE:
-        optional.wander(state, dt, settings)
+        optional.propagate_augmented(state, dt, settings)
 
 
 @njit

@@ -86,7 +86,7 @@ def is_led(state, source):
 
 
 @njit
-def follow(state, aid, work):
+def update_track(state, aid, work):
     """Show the track of a receiver its newest measurement, whose innovation and noise are in ``work``."""
     if aid.stream == GNSS_POSITION:
         take_fix(state, aid.source, work)
@@ -114,7 +114,7 @@ def take_fix(state, source, work):
         start_track(state, source, work)
         return
     nis = predict_track(state, source, work)
-    measure_scatter(state, source, nis, work)
+    inflate_position_for_scatter(state, source, nis, work)
     if not nis <= MISS_GATE:
         state.track_misses[source] += 1
         if state.track_misses[source] >= MISSES:
@@ -213,7 +213,7 @@ def forget_tracks(state):
 
 
 @njit
-def measure_scatter(state, source, nis, work):
+def inflate_position_for_scatter(state, source, nis, work):
     """Take into account how far a fix is from its track, as a factor on the variance it claims.
 
     Unless the track knows too little to tell.

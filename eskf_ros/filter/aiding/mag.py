@@ -95,7 +95,7 @@ def linearize(state, payload, settings, work):
 
 
 @njit
-def is_disturbed(state, aid, settings):
+def update_disturbance(state, aid, settings):
     """Say whether strength or inclination of the field are, or were a moment ago, other than the Earth's here.
 
     What they are is kept for the monitor.
@@ -122,7 +122,7 @@ def is_disturbed(state, aid, settings):
 
 
 @njit
-def note_way(state, heading, settings):
+def propagate_mag_error(state, heading, settings):
     """Let the error of the field change with what was turned and travelled.
 
     ``heading`` (rad). The error fades by exp(-way) and is driven so that its variance stays as it was at first (Gelb,
