@@ -4,7 +4,8 @@ The kernels are plain Python that numba compiles. Without numba, or with ``NUMBA
 runs uncompiled and keeps up with an IMU of about 100 Hz.
 
 numba notices a changed source file only for the function it compiles, not for what that function calls in other
-files. The cache folder therefore carries a digest of all files with kernels: a new version never runs old code.
+files. The cache folder therefore carries a digest of all files with kernels and of what they import: a new version
+never runs old code.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import hashlib
 import itertools
 import math
 import os
+import re
 import shutil
 import tempfile
 import time
@@ -39,15 +41,30 @@ USUAL_COUNT = 500
 
 _KEPT_CACHES = 4
 
+_IMPORT = re.compile(rb"^from eskf_ros\.([\w.]+) import", re.MULTILINE)
+"""An import within the package, in the one form it has here but for ``from eskf_ros import MODULE``."""
 
-def _sources_digest() -> str:
-    package = Path(__file__).parent
+
+def _sources_digest(package: Path) -> str:
+    """Return a digest of the files with kernels and of all that they import from ``package``, however indirectly.
+
+    numba freezes the constants that a kernel takes from other files into its machine code.
+    """
+    texts = {source: source.read_bytes() for source in package.rglob("*.py")}
+    found: set[Path] = set()
+    waiting = [source for source, text in texts.items() if b"@njit" in text]
+    while waiting:
+        source = waiting.pop()
+        if source in found:
+            continue
+        found.add(source)
+        for name in _IMPORT.findall(texts[source]):
+            imported = package.joinpath(*name.decode().split("."))
+            waiting += [imported.with_suffix(".py")] if imported.with_suffix(".py") in texts else imported.glob("*.py")
     digest = hashlib.sha256()
-    for source in sorted(package.rglob("*.py")):
-        text = source.read_bytes()
-        if b"@njit" in text:
-            digest.update(source.relative_to(package).as_posix().encode())
-            digest.update(text)
+    for source in sorted(found):
+        digest.update(source.relative_to(package).as_posix().encode())
+        digest.update(texts[source])
     return digest.hexdigest()[:16]
 
 
@@ -55,7 +72,7 @@ def _cache_folder() -> Path:
     """Return a writable folder for this version's machine code, in the user's cache or else in the temporary folder."""
     user_cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     for parent in (user_cache / "eskf_ros", Path(tempfile.gettempdir()) / f"eskf_ros_{os.getuid()}"):
-        folder = parent / _sources_digest()
+        folder = parent / _sources_digest(Path(__file__).parent)
         try:
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import random
+import shutil
 import signal
 import struct
 import subprocess
@@ -22,7 +23,7 @@ from hypothesis import strategies as st
 from ros_process import Ros, free_domain, needs_ros
 
 import eskf_ros
-from eskf_ros.compiled import COMPILED, sentence_on_compiling
+from eskf_ros.compiled import COMPILED, _sources_digest, sentence_on_compiling
 from eskf_ros.filter.layout import ODOMETRY, allocate
 from eskf_ros.node.cdr import ImuReader, LayoutError, OdometryMessageWriter, OdometryWriter, imu_from_message
 from eskf_ros.node.clocks import Stamp, StampMonitor, clock_complaints
@@ -859,6 +860,27 @@ def test_compiling_is_told_and_loading_from_the_cache_is_not(tmp_path: Path) -> 
     for expected in ("[1, 2]\n", "[]\n"):
         command = [sys.executable, str(script)]
         assert subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout == expected
+
+
+@pytest.mark.parametrize(
+    ("file", "is_compiled_anew"),
+    [
+        ("filter/update.py", True),  # has kernels
+        ("filter/layout.py", True),  # has none, but kernels take its constants
+        ("node/planar.py", True),
+        ("replay/main.py", False),
+        ("api.py", False),
+    ],
+)
+def test_machine_code_is_that_of_the_kernels_and_of_what_they_import(
+    tmp_path: Path, file: str, is_compiled_anew: bool
+) -> None:
+    package = tmp_path / "eskf_ros"
+    shutil.copytree(Path(eskf_ros.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    before = _sources_digest(package)
+    assert before == _sources_digest(Path(eskf_ros.__file__).parent)
+    (package / file).write_text((package / file).read_text(encoding="utf-8") + "\nANOTHER = 1\n", encoding="utf-8")
+    assert (_sources_digest(package) != before) == is_compiled_anew
 
 
 def test_compiling_says_so_at_once_and_then_seldom() -> None:
