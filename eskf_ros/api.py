@@ -41,7 +41,7 @@ from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.timeline import EARLY_AIDS, JUMP_CONFIRMATIONS, LARGEST_JUMP
 from eskf_ros.geodesy.map_frame import MapFrame, to_geodetic
 from eskf_ros.parameters import Parameters, from_mapping, load
-from eskf_ros.replay.summary import CHI_SQUARE_95, final_result
+from eskf_ros.replay.summary import CHI_SQUARE_95, counted, final_result, named
 
 __all__ = ["Filter", "Result", "run"]
 
@@ -60,7 +60,6 @@ LARGEST_SECONDS = 1e11
 SHORTEST_STEP = 100_000
 """Integers that usually follow each other more closely (ns) are milliseconds or microseconds."""
 
-FUSED = (Verdict.FUSED, Verdict.WEIGHED_DOWN, Verdict.RESET)
 DROPS = {
     Verdict.OUTSIDE_HISTORY: "older than the window history.window behind the IMU, or in a gap of the IMU",
     Verdict.DUPLICATE: "a second one with the same stamp",
@@ -276,7 +275,7 @@ class Filter:
             rows,
         )
 
-    def refuse_apart(self) -> None:
+    def _refuse_apart(self) -> None:
         """Raise ValueError for an input whose stamps, with its time offset, have no time in common with the IMU's."""
         if "imu" not in self._spans:
             return
@@ -371,12 +370,13 @@ class Filter:
         lines = []
         for name, reason in IMU_DROPS.items():
             if count := summary["imu"][name]:
-                lines.append(f"imu: {count} of {summary['imu']['offered']} samples dropped, {name.upper()}: {reason}")
+                lines.append(f"imu: {count} of {summary['imu']['offered']} samples dropped, {name}: {reason}")
         constraints = {STREAM_NAMES[stream] for stream in CONSTRAINTS}
         for name, aid in summary["aids"].items():
             for verdict, reason in DROPS.items():
-                if name not in constraints and (count := aid["verdicts"].get(verdict.name)):
-                    lines.append(f"{name}: {count} of {aid['offered']} dropped, {verdict.name}: {reason}")
+                why = verdict.name.lower()
+                if name not in constraints and (count := aid["verdicts"].get(why)):
+                    lines.append(f"{name}: {count} of {aid['offered']} dropped, {why}: {reason}")
         for name, columns in self._unused.items():
             if columns:
                 lines.append(f"{name}: these columns are not known and were not used: {', '.join(columns)}")
@@ -418,7 +418,7 @@ def run(
     for name, table in tables.items():
         if table is not None:
             getattr(runner, f"push_{name}")(table)
-    runner.refuse_apart()
+    runner._refuse_apart()
     return runner.result()
 
 
@@ -587,19 +587,14 @@ def _parameters(given: ParametersLike) -> Parameters:
 def _aid_summary(records: NDArray[Any]) -> dict[str, Any]:
     """Counts and consistency of the records (n,) of one stream."""
     counts = np.bincount(records["verdict"], minlength=len(Verdict))
-    fused = int(sum(counts[verdict] for verdict in FUSED))
-    late, waiting = int(counts[Verdict.OUTSIDE_HISTORY]), int(counts[Verdict.WAITING])
     tested = records[np.isfinite(records["nis"])]
     inside = tested["nis"] <= CHI_SQUARE_95[tested["dof"]]
     return {
-        "offered": len(records),
-        "fused": fused,
-        "rejected": len(records) - fused - late - waiting,
-        "late": late,
-        "waiting": waiting,
+        **counted(counts),
+        "waiting": int(counts[Verdict.WAITING]),
         "nis_mean": float(tested["nis"].mean()) if len(tested) else None,
         "nis_in_95": float(inside.mean()) if len(tested) else None,
-        "verdicts": {verdict.name: int(counts[verdict]) for verdict in Verdict if counts[verdict]},
+        "verdicts": named(counts),
     }
 
 
@@ -634,7 +629,7 @@ def _innovations(records: NDArray[Any]) -> Any:
         {
             "aid": np.array(STREAM_NAMES)[records["stream"]],
             "stamp": records["stamp"],
-            "verdict": np.array([verdict.name for verdict in sorted(Verdict)])[records["verdict"]],
+            "verdict": np.array([verdict.name.lower() for verdict in sorted(Verdict)])[records["verdict"]],
             "dof": records["dof"],
             "nis": records["nis"],
             "innovation": records["innovation"],

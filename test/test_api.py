@@ -140,7 +140,7 @@ def test_early_fixes_by_the_thousand_lose_nothing(short: Tables) -> None:
     runner.push_imu(short["imu"])
     verdicts = runner.result().summary["aids"]["gnss_position"]["verdicts"]
     assert len(stamps) > 4096
-    assert not {"OUTSIDE_HISTORY", "BAD_STAMP", "WAITING"} & set(verdicts)
+    assert not {"outside_history", "bad_stamp", "waiting"} & set(verdicts)
 
 
 @pytest.mark.parametrize("form", ["float", "datetime64[ns]", "datetime64[us]", "uint64"])
@@ -148,8 +148,7 @@ def test_forms_of_stamps(short: Tables, form: str) -> None:
     tables = short
     for name, table in short.items():
         stamps = table["stamp"]
-        if form == "datetime64[us]" and (stamps % 1000).any():
-            pytest.skip("stamps with nanoseconds")
+        assert not (stamps % 1000).any(), "microseconds cannot hold these stamps"
         given = stamps * 1e-9 if form == "float" else stamps.astype("datetime64[ns]" if form[0] == "d" else form)
         tables = changed(tables, name, stamp=given.astype(form) if form[0] == "d" else given)
     assert bits(run(tables)) == bits(run(short))
@@ -199,7 +198,7 @@ def test_what_is_dropped_is_said(short: Tables) -> None:
     runner.update()
     runner.push_gnss_position(fixes)
     text = "\n".join(runner.result().warnings)
-    for part in ("OUTSIDE_HISTORY", "DUPLICATE", "temperature"):
+    for part in ("outside_history", "duplicate", "temperature"):
         assert part in text
 
 

@@ -16,6 +16,10 @@ from eskf_ros.filter.layout import AID, ODOMETRY, RECORD, Status, Stream, Verdic
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.settings import settings_from
 from eskf_ros.filter.timeline import EARLY_AIDS
+from eskf_ros.gnss.measurements import MEASURED_SIGNAL
+from eskf_ros.gnss.ranges import CODE_VALID
+from eskf_ros.gnss.ranges import Status as RangeStatus
+from eskf_ros.gnss.signals import Gnss
 from eskf_ros.parameters import Parameters, from_mapping
 from eskf_ros.simulate.scenario import Recording, simulate
 
@@ -424,8 +428,29 @@ def test_measurements_dropped_before_the_first_imu_sample_are_said():
     for k in range(EARLY_AIDS + 3):
         navigator.push_gnss_velocity(SECOND + k, (0.0, 0.0, 0.0), GOOD_COVARIANCE)
     (sentence,) = navigator.complaints
-    assert "3 messages of gnss_velocity were dropped" in sentence
+    assert "3 measurements of gnss_velocity were dropped" in sentence
     assert "order of their stamps" in sentence
+
+
+def test_ranges_dropped_before_the_first_imu_sample_are_said():
+    navigator = Navigator(from_mapping({"mode": "tight"}))
+    signals = np.zeros(8, MEASURED_SIGNAL)
+    signals["status"], signals["flags"], signals["signal"] = RangeStatus.USABLE, CODE_VALID, 0
+    signals["gnss_id"], signals["sv_id"] = Gnss.GPS, np.arange(1, 9)
+    epochs = EARLY_AIDS // len(signals) + 1
+    for k in range(epochs):
+        navigator.push_ranges(SECOND + k, (2300, 0.0), signals)
+    (sentence,) = navigator.complaints
+    assert f"{len(signals)} measurements of pseudorange were dropped" in sentence
+
+
+def test_a_refused_stamp_is_not_counted():
+    navigator = Navigator(Parameters())
+    with pytest.raises(TypeError, match="int64 nanoseconds"):
+        navigator.push_gnss_velocity(1.5, (0.0, 0.0, 0.0), GOOD_COVARIANCE)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="int64 nanoseconds"):
+        navigator.push_ranges(1.5, (2300, 0.0), np.zeros(0, MEASURED_SIGNAL))  # type: ignore[arg-type]
+    assert not navigator._offered_count
 
 
 @pytest.mark.parametrize("stream", [stream for stream in Stream if stream != Stream.IMU])

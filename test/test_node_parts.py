@@ -896,10 +896,14 @@ def test_compiling_says_so_at_once_and_then_seldom() -> None:
 def test_the_command_compiles_without_ros_and_says_where() -> None:
     code = (
         "import sys; sys.modules['rclpy'] = None; from eskf_ros.node.main import main; status = main(['--compile']); "
-        "from eskf_ros.compiled import CACHE_FOLDER; print(CACHE_FOLDER); sys.exit(status)"
+        "from eskf_ros.compiled import CACHE_FOLDER; from eskf_ros.filter import navigator; "
+        "from eskf_ros.node import odometry; "
+        "print(len(navigator.advance.signatures), len(navigator.offer_signals.signatures), "
+        "len(odometry.fill_odometry.signatures)); print(CACHE_FOLDER); sys.exit(status)"
     )
     ended = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
-    *_, said, folder = ended.stdout.splitlines()
+    *_, said, compiled, folder = ended.stdout.splitlines()
+    assert "0" not in compiled.split()
     assert said == f"eskf_node: compiled; the machine code is in {folder}"
     assert list(Path(folder).rglob("*.nbc"))
 

@@ -229,7 +229,9 @@ def test_only_the_simulator_imports_the_simulator():
         if source.is_relative_to(package / "simulate"):
             continue
         for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
-            names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            names = []
+            if isinstance(node, ast.ImportFrom):
+                names += [f"{node.module}.{alias.name}" for alias in node.names]
             names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             if any(name.startswith("eskf_ros.simulate") for name in names):
                 importers.append(source.relative_to(package).as_posix())
@@ -244,7 +246,7 @@ def test_functions_that_promise_to_look_do_not_write_the_state():
             if not isinstance(function, ast.FunctionDef) or not function.name.startswith(("is_", "has_")):
                 continue
             for node in ast.walk(function):
-                targets = node.targets if isinstance(node, ast.Assign) else []
+                targets = [*node.targets] if isinstance(node, ast.Assign) else []
                 targets += [node.target] if isinstance(node, ast.AugAssign) else []
                 if any(ast.unparse(target).startswith("state.") for target in targets):
                     writers.append(f"{source.name}: {function.name}")

@@ -24,6 +24,7 @@ from scipy.stats import chi2
 
 from eskf_ros import parameters
 from eskf_ros.bags import BagWriter, open_bag
+from eskf_ros.compiled import COMPILED
 from eskf_ros.filter.layout import Status
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.replay.digits import tum_text
@@ -505,6 +506,19 @@ def test_ctrl_c_leaves_nothing_half_done(tmp_path: Path, earlier: bool) -> None:
     assert out == ""
     assert error == "eskf_replay: interrupted; nothing is written for the recording in progress\n"
     assert sorted(tmp_path.rglob("*")) == ([out_folder, folder, folder / "summary.json"] if earlier else [])
+
+
+@pytest.mark.skipif(not COMPILED, reason="the kernels run uncompiled here")
+def test_a_first_start_says_at_once_that_it_compiles(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "eskf_ros.replay.main", str(BAG), "--config", str(CONFIG), "--out", str(tmp_path)]
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    environment["XDG_CACHE_HOME"] = str(tmp_path / "cache")
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment, cwd=CHECKOUT) as process:
+        assert process.stderr is not None
+        first = process.stderr.readline()
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=60.0)
+    assert first.startswith("eskf_replay: compiling the estimator: 1 functions in ")
 
 
 def test_tum_text_writes_as_python_does() -> None:

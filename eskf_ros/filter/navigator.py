@@ -317,7 +317,7 @@ class Navigator:
             TypeError: the stamps are not integers: seconds as floats cannot hold nanoseconds.
             ValueError: an array has another shape.
         """
-        stamps = _nanoseconds(stamps)
+        stamps = _whole_stamps(stamps)
         specific_force = _vectors("specific_force", specific_force, len(stamps))
         angular_rate = _vectors("angular_rate", angular_rate, len(stamps))
         parts = []
@@ -447,7 +447,7 @@ class Navigator:
         is_tight, ranges = self.parameters.mode == "tight", self.parameters.ranges
         code_door = Verdict.WAITING if is_tight and ranges.use else Verdict.DISABLED
         rate_door = Verdict.WAITING if is_tight and ranges.use_doppler else Verdict.DISABLED
-        stamp += round(ranges.time_offset * SECOND)
+        stamp = _whole_stamp(stamp) + round(ranges.time_offset * SECOND)
         self._make_room(2 * len(signals))
         refused = np.zeros(2 * len(signals), RECORD)
         count = offer_signals(
@@ -466,8 +466,11 @@ class Navigator:
         )
         for stream in (Stream.PSEUDORANGE, Stream.RANGE_RATE):
             self._offered_count[stream] += 1
-            if (refused["stream"][:count] == stream).any():
+            verdicts = refused["verdict"][:count][refused["stream"][:count] == stream]
+            if len(verdicts):
                 self._note_refused(stream, stamp)
+            if early := int(np.count_nonzero(verdicts == Verdict.BEFORE_ALIGNMENT)):
+                self._early[stream] += early
         if count:
             self._refused.append(refused[:count])
 
@@ -645,8 +648,8 @@ class Navigator:
                 found.append(f"{count} of {offered} messages of {stream.name.lower()} {DOOR_REMEDIES[verdict]}")
         for stream, count in self._early.items():
             found.append(
-                f"{count} messages of {stream.name.lower()} were dropped because more than {EARLY_AIDS} measurements "
-                "waited for the first IMU sample: push measurements and IMU samples in the order of their stamps, or "
+                f"{count} measurements of {stream.name.lower()} were dropped because more than {EARLY_AIDS} waited for "
+                "the first IMU sample: push measurements and IMU samples in the order of their stamps, or "
                 "look why the IMU is silent"
             )
         for stream, difference in self._stamp_difference.items():
@@ -735,11 +738,11 @@ class Navigator:
 
     def _push_aid(self, stream: Stream, stamp: int, arrival: int, source: int, door: int) -> None:
         """Sort the record that is on offer into the timeline."""
+        stamp = _whole_stamp(stamp)
         self._offered_count[stream] += 1
         if door != OPEN_DOOR:
             self._shut_doors[stream, Verdict(door)] += 1
         self._make_room()
-        stamp = _nanosecond(stamp)
         refused = offer_aid(self._aids, self._timeline, self._offered, stamp, arrival, int(stream), source, door)
         if refused:
             self._refuse(stream, stamp, arrival, source, Verdict(refused))
@@ -824,7 +827,7 @@ def _copied(records: np.ndarray, count: int) -> np.ndarray:
     return np.frombuffer(bytearray(records[:count].tobytes()), records.dtype)
 
 
-def _nanosecond(stamp: int) -> int:
+def _whole_stamp(stamp: int) -> int:
     """Return a stamp as an int; raises TypeError for one that is not an integer."""
     try:
         return operator.index(stamp)
@@ -834,7 +837,7 @@ def _nanosecond(stamp: int) -> int:
         ) from None
 
 
-def _nanoseconds(stamps: StampArray) -> StampArray:
+def _whole_stamps(stamps: StampArray) -> StampArray:
     """Return stamps as int64; raises TypeError for those that are not integers."""
     found = np.asarray(stamps)
     if found.ndim != 1:

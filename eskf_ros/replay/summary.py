@@ -111,25 +111,14 @@ class Summary:
         return sum(self._feed.withheld[kind] for kind in inputs)
 
     def _aid(self, stream: Stream) -> dict[str, Any]:
-        """`rejected` is every verdict but fused, waiting, and outside_history, which is `late`."""
         verdicts, tested = self._verdicts[stream], int(self._nis_count[stream])
-        fused = int(verdicts[Verdict.FUSED] + verdicts[Verdict.WEIGHED_DOWN] + verdicts[Verdict.RESET])
-        late, waiting = int(verdicts[Verdict.OUTSIDE_HISTORY]), int(verdicts[Verdict.WAITING])
-        offered = int(verdicts.sum())
         return {
-            "offered": offered,
-            "fused": fused,
-            "rejected": offered - fused - late - waiting,
-            "late": late,
+            **counted(verdicts),
             "withheld": self._withheld(stream),
             "nis_mean": float(self._nis_sum[stream] / tested) if tested else None,
             "nis_in_95": float(self._nis_inside[stream] / tested) if tested else None,
-            "verdicts": self._verdict_counts(stream),
+            "verdicts": named(verdicts),
         }
-
-    def _verdict_counts(self, stream: Stream) -> dict[str, int]:
-        counts = self._verdicts[stream]
-        return {verdict.name.lower(): int(counts[verdict]) for verdict in Verdict if counts[verdict]}
 
     def outages(self, compared: NDArray[Any] | None) -> list[dict[str, Any]]:
         """For each outage the length of the estimated path and, with truth, the errors at its last compared epoch."""
@@ -166,13 +155,13 @@ class Summary:
             )
         if not self._rows:
             verdicts = ", ".join(
-                f"{count} {name}" for name, count in self._verdict_counts(Stream.GNSS_POSITION).items()
+                f"{count} {name}" for name, count in named(self._verdicts[Stream.GNSS_POSITION]).items()
             )
             fixes = topics.of(Stream.GNSS_POSITION)
             if fixes:
                 lines.append(f"no position was found; what became of the fixes of {fixes}: {verdicts or 'none came'}")
             else:
-                verdicts = ", ".join(f"{n} {name}" for name, n in self._verdict_counts(Stream.PSEUDORANGE).items())
+                verdicts = ", ".join(f"{n} {name}" for name, n in named(self._verdicts[Stream.PSEUDORANGE]).items())
                 lines.append(f"no position was found; what became of the pseudoranges: {verdicts or 'none came'}")
         return lines
 
@@ -228,6 +217,22 @@ def _consistency(values: NDArray[np.float64]) -> dict[str, float] | None:
     if not len(values):
         return None
     return {"mean": float(values.mean()), "in_95": float(np.mean(values <= CHI_SQUARE_95[3]))}
+
+
+def counted(verdicts: NDArray[np.int64]) -> dict[str, int]:
+    """What became of the measurements of an aid, of counts by `Verdict`.
+
+    `rejected` is every verdict but fused, waiting, and outside_history, which is `late`.
+    """
+    offered, waiting = int(verdicts.sum()), int(verdicts[Verdict.WAITING])
+    fused = int(verdicts[Verdict.FUSED] + verdicts[Verdict.WEIGHED_DOWN] + verdicts[Verdict.RESET])
+    late = int(verdicts[Verdict.OUTSIDE_HISTORY])
+    return {"offered": offered, "fused": fused, "rejected": offered - fused - late - waiting, "late": late}
+
+
+def named(verdicts: NDArray[np.int64]) -> dict[str, int]:
+    """Counts by `Verdict` under its name, those that occur."""
+    return {verdict.name.lower(): int(verdicts[verdict]) for verdict in Verdict if verdicts[verdict]}
 
 
 def final_result(row: NDArray[Any], datum: tuple[float, float, float] | None) -> dict[str, Any]:
