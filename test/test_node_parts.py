@@ -897,8 +897,8 @@ def test_the_command_compiles_without_ros_and_says_where() -> None:
     code = (
         "import sys; sys.modules['rclpy'] = None; from eskf_ros.node.main import main; status = main(['--compile']); "
         "from eskf_ros.compiled import CACHE_FOLDER; from eskf_ros.filter import navigator; "
-        "from eskf_ros.node import odometry; "
-        "print(len(navigator.advance.signatures), len(navigator.offer_signals.signatures), "
+        "from eskf_ros.gnss import measurements; from eskf_ros.node import odometry; "
+        "print(len(navigator.advance.signatures), len(measurements.measure.signatures), "
         "len(odometry.fill_odometry.signatures)); print(CACHE_FOLDER); sys.exit(status)"
     )
     ended = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
