@@ -37,13 +37,6 @@ from eskf_ros.filter.strapdown import gravity_map
 from eskf_ros.filter.track import is_led
 from eskf_ros.rotation import cross, rotate, to_matrix
 
-GNSS_POSITION = int(Stream.GNSS_POSITION)
-GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
-FUSED = int(Verdict.FUSED)
-WEIGHED_DOWN = int(Verdict.WEIGHED_DOWN)
-CONTRADICTED = int(Verdict.CONTRADICTED)
-RESET = int(Verdict.RESET)
-
 FAULTS = 4
 TIME = 3
 """Three axes of the lever arm (m, body), and the time offset (s)."""
@@ -90,13 +83,13 @@ SHRINKING = 0.9
 def watch_aid(state, aid, size, gate, work, settings):
     """Learn from a measurement that went through the update; ``gate`` and ``work`` as they were for it."""
     learn_faults(state, aid, size, gate, work, settings)
-    if aid.stream == GNSS_POSITION:
+    if aid.stream == Stream.GNSS_POSITION:
         watch_fix(state, aid)
-    elif aid.stream == GNSS_VELOCITY:
+    elif aid.stream == Stream.GNSS_VELOCITY:
         watch_velocity(state, aid)
-    if aid.stream == GNSS_VELOCITY or (aid.stream == GNSS_POSITION and not is_led(state, aid.source)):
+    if aid.stream == Stream.GNSS_VELOCITY or (aid.stream == Stream.GNSS_POSITION and not is_led(state, aid.source)):
         watch_departure(state, aid.source, work)
-    if aid.stream == GNSS_POSITION:
+    if aid.stream == Stream.GNSS_POSITION:
         watch_heading_std(state, settings)
 
 
@@ -108,13 +101,13 @@ def write_effect(state, aid, work, settings):
         for k in range(FAULTS):
             effect[i, k] = 0.0
     rotation = to_matrix(state.attitude)
-    if aid.stream == GNSS_POSITION:
+    if aid.stream == Stream.GNSS_POSITION:
         velocity = predict(state, aid.source, settings)
         for i in range(3):
             for k in range(3):
                 effect[i, k] = rotation[i][k]
             effect[i, TIME] = velocity[i]
-    elif aid.stream == GNSS_VELOCITY:
+    elif aid.stream == Stream.GNSS_VELOCITY:
         rate = body_rate(state, rotation)
         force, bias = state.specific_force, state.accel_bias
         felt = rotate(rotation, (force[0] - bias[0], force[1] - bias[1], force[2] - bias[2]))
@@ -136,13 +129,13 @@ def learn_faults(state, aid, size, gate, work, settings):
     if state.fault_stamp == NEVER:
         state.fault_absorbed[:] = 0.0
     dt = carry_absorbed(state)
-    accepted = aid.verdict in (FUSED, WEIGHED_DOWN)
+    accepted = aid.verdict in (Verdict.FUSED, Verdict.WEIGHED_DOWN)
     for source in range(SOURCES):
         absorbed = state.fault_absorbed[source]
         write_effect(state, aid, work, settings)
         effect = work.effect
-        is_own = source == aid.source and aid.stream in (GNSS_POSITION, GNSS_VELOCITY)
-        if is_own and aid.verdict == RESET:
+        is_own = source == aid.source and aid.stream in (Stream.GNSS_POSITION, Stream.GNSS_VELOCITY)
+        if is_own and aid.verdict == Verdict.RESET:
             for i in range(3):
                 for k in range(FAULTS):
                     absorbed[i, k] = effect[i, k]
@@ -153,7 +146,7 @@ def learn_faults(state, aid, size, gate, work, settings):
                     effect[a, k] = 0.0
                 for i in range(ERROR_SIZE):
                     effect[a, k] -= work.jacobian[a, i] * absorbed[i, k]
-        if is_own and aid.verdict != CONTRADICTED:
+        if is_own and aid.verdict != Verdict.CONTRADICTED:
             weigh_faults(state, source, dt, min(1.0, gate / max(aid.nis, 1e-9)), work)
         if accepted:
             for i in range(ERROR_SIZE):
@@ -227,7 +220,7 @@ def watch_fix(state, aid):
     if factor > 1.0:
         state.scattered_fixes[source] += 1
         state.scatter_sum[source] += factor
-    if aid.verdict == CONTRADICTED:
+    if aid.verdict == Verdict.CONTRADICTED:
         rate = state.track_rate[source]
         state.contradicted_fixes[source] += 1
         speed = math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)

@@ -7,10 +7,6 @@ import math
 from eskf_ros.compiled import njit
 from eskf_ros.filter.layout import Verdict
 
-OPEN = int(Verdict.WAITING)
-NON_FINITE = int(Verdict.NON_FINITE)
-BAD_COVARIANCE = int(Verdict.BAD_COVARIANCE)
-
 VARIANCES = (3, 6, 8)
 """Where the variances of the three values are in the payload."""
 
@@ -49,7 +45,7 @@ def admit(offered, values, covariance, stand_in, scale, std_floor, may_lack_axes
         lacking = take_out_absent_axes(payload)
     for i in range(9):
         if not math.isfinite(payload[i]):
-            return NON_FINITE
+            return Verdict.NON_FINITE
     lowest = min(payload[3], payload[6], payload[8])
     for i in range(3, 9):
         payload[i] *= scale
@@ -63,8 +59,8 @@ def admit(offered, values, covariance, stand_in, scale, std_floor, may_lack_axes
         if lacking & (1 << i):
             payload[VARIANCES[i]] = ABSENT
     if lowest < 0.0 or not (xx * yy - xy * xy > 0.0 and determinant > 0.0) or lacking == 7:
-        return BAD_COVARIANCE
-    return OPEN
+        return Verdict.BAD_COVARIANCE
+    return Verdict.WAITING
 
 
 @njit

@@ -19,7 +19,7 @@ from eskf_ros.filter.aiding import (
 from eskf_ros.filter.alignment import reset_position_to_fix
 from eskf_ros.filter.heading_hints import update_unknown_heading
 from eskf_ros.filter.heading_start import heading_of, reset_heading_from_memory, search_heading
-from eskf_ros.filter.layout import CONSTRAINTS, Stream, Verdict
+from eskf_ros.filter.layout import SENSOR_STREAMS, Stream, Verdict
 from eskf_ros.filter.local import note_jump
 from eskf_ros.filter.monitors import watch_course, watch_field, watch_heading
 from eskf_ros.filter.optional import join
@@ -30,23 +30,6 @@ from eskf_ros.filter.timeline import open_record
 from eskf_ros.filter.track import update_track
 from eskf_ros.filter.update import update
 from eskf_ros.filter.wheel_heading import search_with_wheels
-
-GNSS_POSITION = int(Stream.GNSS_POSITION)
-GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
-WHEEL = int(Stream.WHEEL)
-BODY_VELOCITY = int(Stream.BODY_VELOCITY)
-ZUPT = int(Stream.ZUPT)
-ZARU = int(Stream.ZARU)
-NHC = int(Stream.NHC)
-HEADING = int(Stream.HEADING)
-MAG = int(Stream.MAG)
-BARO = int(Stream.BARO)
-FIRST_CONSTRAINT = int(min(CONSTRAINTS))
-FUSED = int(Verdict.FUSED)
-GATE = int(Verdict.GATE)
-BEFORE_ALIGNMENT = int(Verdict.BEFORE_ALIGNMENT)
-INACTIVE = int(Verdict.INACTIVE)
-DISABLED = int(Verdict.DISABLED)
 
 UNKNOWN_STREAM = -1
 """Instead of a size, for a stream without a branch in `linearize`: it is refused with a record, never fused."""
@@ -59,7 +42,7 @@ def fuse(state, aids, i, settings, work):
         return
     aid = aids[i]
     update_motion_evidence(state, aid, settings)
-    if aid.stream == GNSS_POSITION and state.level_known == 1 and state.position_known == 0:
+    if aid.stream == Stream.GNSS_POSITION and state.level_known == 1 and state.position_known == 0:
         begin(state, aid, settings)
     position_before = (state.position_map[0], state.position_map[1], state.position_map[2])
     heading_before = heading_of(state, settings)
@@ -73,9 +56,9 @@ def offer(state, aid, heading_before, settings, work):
     if not is_aligned_for(state, aid.stream):
         wait_for_alignment(state, aid, settings, work)
         return
-    if aid.stream == HEADING and aid.source == heading.IMU_ORIENTATION and state.heading_known == 1:
+    if aid.stream == Stream.HEADING and aid.source == heading.IMU_ORIENTATION and state.heading_known == 1:
         # It is made of the same IMU: good for a start, and nothing new afterwards.
-        aid.verdict = INACTIVE
+        aid.verdict = Verdict.INACTIVE
         return
     join(state, settings.reach[aid.stream], settings)
     reset_for_new_solution(state, aid, settings)
@@ -87,20 +70,20 @@ def offer(state, aid, heading_before, settings, work):
     aid.verdict, aid.nis = update(state, size, gate, work)
     recover(state, aid, size, gate, settings, work)
     watch_aid(state, aid, size, gate, work, settings)
-    if aid.verdict == FUSED and state.heading_known == 0:
+    if aid.verdict == Verdict.FUSED and state.heading_known == 0:
         search_heading(state, aid, gate, settings, work)
-    if aid.stream == GNSS_POSITION:
+    if aid.stream == Stream.GNSS_POSITION:
         mag.note_field(state, aid, mag.FIELD)
-    elif aid.stream == WHEEL:
+    elif aid.stream == Stream.WHEEL:
         watch_wheels(state, aid)
 
 
 @njit
 def update_motion_evidence(state, aid, settings):
     """Note what a measurement says of place, course, motion and rest: that counts whatever becomes of it."""
-    if aid.stream == GNSS_POSITION:
+    if aid.stream == Stream.GNSS_POSITION:
         update_evidence_from_fix(state, aid, settings)
-    elif aid.stream == GNSS_VELOCITY:
+    elif aid.stream == Stream.GNSS_VELOCITY:
         update_evidence_from_velocity(state, aid, settings)
         watch_course(state, aid, heading_of(state, settings), settings)
     update_rest_evidence(state, aid, settings)
@@ -109,10 +92,10 @@ def update_motion_evidence(state, aid, settings):
 @njit
 def wait_for_alignment(state, aid, settings, work):
     """Leave a measurement that comes too early; wheels help to find the heading before they are fused."""
-    if aid.stream == WHEEL:
-        search_with_wheels(state, aid.payload, settings.gate[WHEEL, 2], settings, work)
+    if aid.stream == Stream.WHEEL:
+        search_with_wheels(state, aid.payload, settings.gate[Stream.WHEEL, 2], settings, work)
         watch_wheels(state, aid)
-    aid.verdict = BEFORE_ALIGNMENT if aid.stream < FIRST_CONSTRAINT else INACTIVE
+    aid.verdict = Verdict.BEFORE_ALIGNMENT if aid.stream < SENSOR_STREAMS else Verdict.INACTIVE
 
 
 @njit
@@ -131,26 +114,26 @@ def measure(state, aid, heading_before, settings, work):
 
     A heading is what the first of those that tell it makes known: the measurement is linearized anew there.
     """
-    if aid.stream == MAG:
+    if aid.stream == Stream.MAG:
         mag.propagate_mag_error(state, heading_before, settings)
         is_disturbed = mag.update_disturbance(state, aid, settings)
         watch_field(state, is_disturbed)
         if is_disturbed:
-            aid.verdict = GATE
-            note(state, MAG, aid.source, GATE)
+            aid.verdict = Verdict.GATE
+            note(state, Stream.MAG, aid.source, Verdict.GATE)
             return 0
     size = linearize(state, aid, settings, work)
     if size == UNKNOWN_STREAM:
-        aid.verdict = DISABLED
+        aid.verdict = Verdict.DISABLED
         return 0
     if size == 0:
-        aid.verdict = INACTIVE
+        aid.verdict = Verdict.INACTIVE
         return 0
-    if aid.stream in (HEADING, MAG):
+    if aid.stream in (Stream.HEADING, Stream.MAG):
         watch_heading(state, aid, work)
         if state.heading_known == 0:
             if not update_unknown_heading(state, aid, settings, work):
-                aid.verdict = BEFORE_ALIGNMENT
+                aid.verdict = Verdict.BEFORE_ALIGNMENT
                 return 0
             size = linearize(state, aid, settings, work)
     for k in range(size):
@@ -164,11 +147,11 @@ def is_aligned_for(state, stream):
     """Say whether the start-up is far enough for a measurement of a stream."""
     if state.level_known == 0:
         return False
-    if stream == GNSS_POSITION:
+    if stream == Stream.GNSS_POSITION:
         return True
-    if stream in (GNSS_VELOCITY, HEADING, BARO):
+    if stream in (Stream.GNSS_VELOCITY, Stream.HEADING, Stream.BARO):
         return state.position_known == 1
-    if stream == MAG:
+    if stream == Stream.MAG:
         return state.position_known == 1 and state.field_known == 1
     return state.position_known == 1 and state.heading_known == 1
 
@@ -179,24 +162,24 @@ def linearize(state, aid, settings, work):
 
     Size 0: the measurement says nothing in this state. `UNKNOWN_STREAM`: nothing here knows what it measures.
     """
-    if aid.stream == GNSS_POSITION:
+    if aid.stream == Stream.GNSS_POSITION:
         return gnss_position.linearize(state, aid.payload, aid.source, settings, work)
-    if aid.stream == WHEEL:
+    if aid.stream == Stream.WHEEL:
         return wheel.linearize(state, aid.payload, settings, work)
-    if aid.stream == BODY_VELOCITY:
+    if aid.stream == Stream.BODY_VELOCITY:
         return body_velocity.linearize(state, aid.payload, settings, work)
-    if aid.stream == ZUPT:
+    if aid.stream == Stream.ZUPT:
         return zupt.linearize(state, settings, work)
-    if aid.stream == ZARU:
+    if aid.stream == Stream.ZARU:
         return zaru.linearize(state, settings, work)
-    if aid.stream == NHC:
+    if aid.stream == Stream.NHC:
         return nhc.linearize(state, settings, work)
-    if aid.stream == HEADING:
+    if aid.stream == Stream.HEADING:
         return heading.linearize(state, aid.payload, aid.source, settings, work)
-    if aid.stream == MAG:
+    if aid.stream == Stream.MAG:
         return mag.linearize(state, aid.payload, settings, work)
-    if aid.stream == BARO:
+    if aid.stream == Stream.BARO:
         return baro.linearize(state, aid.payload, aid.source, settings, work)
-    if aid.stream == GNSS_VELOCITY:
+    if aid.stream == Stream.GNSS_VELOCITY:
         return gnss_velocity.linearize(state, aid.payload, aid.source, settings, work)
     return UNKNOWN_STREAM

@@ -16,8 +16,6 @@ from eskf_ros.filter.heading_start import heading_of, reset_heading
 from eskf_ros.filter.layout import ERROR_SIZE, GYRO_BIAS, NEVER, VELOCITY, Stream
 from eskf_ros.rotation import wrapped
 
-HEADING = int(Stream.HEADING)
-
 DUAL_ANTENNA = 0
 MAGNETOMETER = 1
 IMU_ORIENTATION = 2
@@ -51,7 +49,7 @@ def update_unknown_heading(state, aid, settings, work):
     if aid.payload[3] < 0.0:
         return False
     rank = MAGNETOMETER
-    if aid.stream == HEADING:
+    if aid.stream == Stream.HEADING:
         rank = DUAL_ANTENNA if aid.source == 0 else IMU_ORIENTATION
     if rank == DUAL_ANTENNA and state.heading_disputed == 1:
         return False
@@ -102,7 +100,7 @@ def update_refutation(state, aid, settings, work):
     better. So what was given holds only if the antennas are heard to agree with it, and not if those that were rejected
     from the beginning agree with each other.
     """
-    is_doubtful = state.given_stamp != NEVER and state.aid_fused_stamp[HEADING, 0] < state.given_stamp
+    is_doubtful = state.given_stamp != NEVER and state.aid_fused_stamp[Stream.HEADING, 0] < state.given_stamp
     if not is_doubtful or aid.source != 0 or not aid.payload[3] > 0.0:
         return False
     std = math.sqrt(aid.payload[3])
@@ -119,7 +117,7 @@ def reset_given_heading(state, aid, settings, work):
     """
     state.given_stamp = NEVER
     state.hint_count = 0
-    if state.aid_fused_stamp[HEADING, 0] == NEVER:
+    if state.aid_fused_stamp[Stream.HEADING, 0] == NEVER:
         restart(state)
         state.heading_disputed = 1
         return False

@@ -15,9 +15,6 @@ from eskf_ros.filter.layout import ATTITUDE, VELOCITY, Stream
 from eskf_ros.filter.local_frame import local_up, turn_attitude
 from eskf_ros.rotation import cross, dot, rotate, rotate_back, to_matrix, wrapped
 
-GNSS_POSITION = int(Stream.GNSS_POSITION)
-GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
-
 COURSE_MAX_STD = 0.17
 COURSE_MAX_TURN_RATE = 0.2
 """Course over ground gives heading only when it is this certain (rad) and the robot turns no faster (rad/s)."""
@@ -68,12 +65,12 @@ def search_heading(state, aid, gate, settings, work):
     """Let a GNSS measurement that was fused take part in the search for the heading, and look whether it is over."""
     rotation = to_matrix(state.attitude)
     arm = settings.lever_arms_body[aid.source]
-    if aid.stream == GNSS_POSITION:
+    if aid.stream == Stream.GNSS_POSITION:
         first = 0
         measured = position_of_fix(state, aid.payload)
         lever = rotate(rotation, arm)
         local_to_ecef = east_north_up_to_ecef(aid.payload[0], aid.payload[1])
-    elif aid.stream == GNSS_VELOCITY:
+    elif aid.stream == Stream.GNSS_VELOCITY:
         first = 2
         local_to_ecef = local_east_north_up_to_ecef(state)
         velocity = rotate(local_to_ecef, (aid.payload[0], aid.payload[1], aid.payload[2]))

@@ -12,8 +12,6 @@ from eskf_ros.filter.layout import NEVER, Stream
 from eskf_ros.filter.sway import can_be_bias
 from eskf_ros.rotation import dot, rotate, wrapped
 
-MAG = int(Stream.MAG)
-
 NO_GRAVITY = 0.5
 """Below this part of gravity on average the accelerometer cannot be a strapdown one in m/s2, at rest or not."""
 
@@ -97,7 +95,7 @@ def note_contrast(sums, angle):
 def watch_heading(state, aid, work):
     """Compare a heading of the dual antenna or the magnetometer, described by ``work``, with the estimate."""
     if aid.source == 0 and state.heading_known == 1 and aid.payload[3] > 0.0:
-        kind = 1 if aid.stream == MAG else 0
+        kind = 1 if aid.stream == Stream.MAG else 0
         note_contrast(state.heading_contrast[kind], work.innovation[0])
 
 

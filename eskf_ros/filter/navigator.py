@@ -74,11 +74,6 @@ from eskf_ros.rotation import to_matrix
 FloatArray = npt.NDArray[np.float64]
 StampArray = npt.NDArray[np.int64]
 
-OPEN_DOOR = int(Verdict.WAITING)
-NO_FIX = int(Verdict.NO_FIX)
-BAD_VALUE = int(Verdict.BAD_VALUE)
-DISABLED = int(Verdict.DISABLED)
-INACTIVE = int(Verdict.INACTIVE)
 
 LONGEST_GAP = 5 * SECOND
 """The IMU was silent for longer (ns): nothing is left of attitude and velocity, start again."""
@@ -383,11 +378,11 @@ class Navigator:
             stand_in = (horizontal, horizontal, vertical)
         values = (math.radians(latitude_deg), math.radians(longitude_deg), float(altitude))
         door = self._admit(Stream.GNSS_POSITION, values, matrix, stand_in)
-        if door == OPEN_DOOR:
+        if door == Verdict.WAITING:
             if status < 0:
-                door = NO_FIX
+                door = Verdict.NO_FIX
             elif abs(latitude_deg) > 90.0 or abs(longitude_deg) > 360.0 or abs(altitude) > HIGHEST_ALTITUDE:
-                door = BAD_VALUE
+                door = Verdict.BAD_VALUE
             elif self.needs_field:
                 field = self._field_at(latitude_deg, longitude_deg, altitude, stamp)
                 self._offered[0]["payload"][mag.FIELD : mag.FIELD + 4] = field
@@ -505,7 +500,7 @@ class Navigator:
     def take_live(self) -> np.ndarray:
         """Return the records of what was judged since the last call, as they stand: a later message may change them."""
         judged = self._aids[: int(self._states["aid_next"][0])]
-        new = np.flatnonzero((judged["told"] == 0) & (judged["verdict"] != INACTIVE))
+        new = np.flatnonzero((judged["told"] == 0) & (judged["verdict"] != Verdict.INACTIVE))
         judged["told"] = 1
         return np.array([tuple(judged[name][i] for name in RECORD.names or ()) for i in new], RECORD)
 
@@ -700,14 +695,14 @@ class Navigator:
         scale, floor, lacks = intake.covariance_scale, intake.std_floor, intake.may_lack_axes
         door = admit(self._offered, values, covariance, stand_in, scale, floor, lacks)
         if not intake.is_used:
-            return DISABLED
-        if door != OPEN_DOOR:
+            return Verdict.DISABLED
+        if door != Verdict.WAITING:
             return int(door)
         if max(map(abs, values)) > intake.largest or values[0] < intake.lowest:
-            return BAD_VALUE
+            return Verdict.BAD_VALUE
         if stand_in is not NO_STAND_IN:
             self._stand_ins += 1
-        return OPEN_DOOR
+        return Verdict.WAITING
 
     def _field_at(
         self, latitude_deg: float, longitude_deg: float, altitude: float, stamp: int
@@ -733,14 +728,14 @@ class Navigator:
         uses_ranges = self.parameters.mode == "tight" or ranges.use_point_solution
         if uses_ranges and not is_second and not from_ranges:
             # The fix is made of the same ranges: both together would count twice.
-            door = DISABLED
+            door = Verdict.DISABLED
         self._push_aid(stream, stamp + round(receiver.time_offset * SECOND), arrival, int(is_second), door)
 
     def _push_aid(self, stream: Stream, stamp: int, arrival: int, source: int, door: int) -> None:
         """Sort the record that is on offer into the timeline."""
         stamp = _whole_stamp(stamp)
         self._offered_count[stream] += 1
-        if door != OPEN_DOOR:
+        if door != Verdict.WAITING:
             self._shut_doors[stream, Verdict(door)] += 1
         self._make_room()
         refused = offer_aid(self._aids, self._timeline, self._offered, stamp, arrival, int(stream), source, door)

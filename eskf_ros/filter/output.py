@@ -11,16 +11,6 @@ from eskf_ros.filter.layout import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, 
 from eskf_ros.filter.level import UNKNOWN_SPEED
 from eskf_ros.rotation import cross, from_matrix, from_rotation_vector, multiply, rotate, rotate_back, to_matrix
 
-WAITING_IMU = int(Status.WAITING_IMU)
-LEVELLING = int(Status.LEVELLING)
-WAITING_FIX = int(Status.WAITING_FIX)
-WAITING_HEADING = int(Status.WAITING_HEADING)
-ALIGNING = int(Status.ALIGNING)
-GOOD = int(Status.GOOD)
-COASTING = int(Status.COASTING)
-DEGRADED = int(Status.DEGRADED)
-FAULT = int(Status.FAULT)
-
 SHORTEST_COAST = 1_000_000_000
 LONGEST_WAIT = 3_000_000_000
 
@@ -32,23 +22,23 @@ CONTRADICTIONS = 3
 def status_of(state, settings):
     """Return the rung of the ladder; coasting is a second without a fix, or twice the usual wait up to three."""
     if state.imu_stamp == NEVER:
-        return WAITING_IMU
+        return Status.WAITING_IMU
     if state.level_known == 0:
-        return LEVELLING
+        return Status.LEVELLING
     if not is_sound(state):
-        return FAULT
+        return Status.FAULT
     if state.position_known == 0:
-        return WAITING_FIX
+        return Status.WAITING_FIX
     if state.heading_known == 0:
-        return WAITING_HEADING
+        return Status.WAITING_HEADING
     patience = max(SHORTEST_COAST, min(LONGEST_WAIT, 2 * state.absolute_interval))
     if state.stamp - state.absolute_stamp > patience:
-        return COASTING
+        return Status.COASTING
     if state.rejected_fixes >= CONTRADICTIONS:
-        return DEGRADED
+        return Status.DEGRADED
     if state.covariance[ATTITUDE + 2, ATTITUDE + 2] > settings.good_heading_std**2:
-        return ALIGNING
-    return GOOD
+        return Status.ALIGNING
+    return Status.GOOD
 
 
 @njit

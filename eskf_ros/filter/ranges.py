@@ -63,18 +63,6 @@ from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, Status
 from eskf_ros.gnss.signals import SPEED_OF_LIGHT
 from eskf_ros.rotation import cross, dot, rotate, to_matrix
 
-PSEUDORANGE = int(Stream.PSEUDORANGE)
-RANGE_RATE = int(Stream.RANGE_RATE)
-WAITING = int(Verdict.WAITING)
-FUSED = int(Verdict.FUSED)
-GATE = int(Verdict.GATE)
-BEFORE_ALIGNMENT = int(Verdict.BEFORE_ALIGNMENT)
-WEIGHED_DOWN = int(Verdict.WEIGHED_DOWN)
-LOW_ELEVATION = int(Verdict.LOW_ELEVATION)
-NON_FINITE = int(Verdict.NON_FINITE)
-BAD_VALUE = int(Verdict.BAD_VALUE)
-USABLE = int(Status.USABLE)
-
 LARGEST_NUMBER = 1e11
 """Beyond every range, satellite and GPS time (m, m/s, s)."""
 
@@ -130,10 +118,10 @@ def offer_signals(
     count = 0
     for k in range(len(signals)):
         signal = signals[k]
-        if signal["status"] != USABLE:
+        if signal["status"] != Status.USABLE:
             continue
-        for stream in (PSEUDORANGE, RANGE_RATE):
-            is_code = stream == PSEUDORANGE
+        for stream in (Stream.PSEUDORANGE, Stream.RANGE_RATE):
+            is_code = stream == Stream.PSEUDORANGE
             if not signal["flags"] & (CODE_VALID if is_code else DOPPLER_VALID):
                 continue
             source = source_of(signal["gnss_id"], signal["sv_id"], signal["signal"])
@@ -149,12 +137,12 @@ def offer_signals(
             payload[CN0] = signal["cn0"]
             payload[NOISE_FACTOR] = signal["noise_factor"]
             payload[GPS_TIME] = gps_time
-            if door == WAITING:
+            if door == Verdict.WAITING:
                 door = judge_signal(payload)
             payload[KLOBUCHAR : KLOBUCHAR + 8] = klobuchar
             payload[FIELD : FIELD + 4] = field
             verdict = offer_aid(aids, timeline, offered, stamp, arrival, stream, source, door)
-            if verdict != WAITING:
+            if verdict != Verdict.WAITING:
                 record = refused[count]
                 record["stamp"], record["arrival"], record["stream"] = stamp, arrival, stream
                 record["source"], record["verdict"], record["dof"] = source, verdict, 0
@@ -171,17 +159,17 @@ def judge_signal(payload):
     largest = max(abs(payload[MEASURED]), abs(payload[GPS_TIME]))
     for i in range(SATELLITE, SATELLITE_VELOCITY + 3):
         if math.isnan(payload[i]):
-            return NON_FINITE
+            return Verdict.NON_FINITE
         largest = max(largest, abs(payload[i]))
     if not math.isfinite(payload[MEASURED] + payload[GPS_TIME] + largest):
-        return NON_FINITE
-    return WAITING if largest < LARGEST_NUMBER else BAD_VALUE
+        return Verdict.NON_FINITE
+    return Verdict.WAITING if largest < LARGEST_NUMBER else Verdict.BAD_VALUE
 
 
 @njit
 def is_range(stream):
     """Say whether a stream carries signals."""
-    return stream in (PSEUDORANGE, RANGE_RATE)
+    return stream in (Stream.PSEUDORANGE, Stream.RANGE_RATE)
 
 
 @njit
@@ -204,7 +192,7 @@ def fuse_ranges(state, aids, first, end, settings, work):
         return
     position = (state.position_map[0], state.position_map[1], state.position_map[2])
     heading = heading_of(state, settings)
-    offer_epoch(state, aids, first, end, 0 if aids[first].stream == PSEUDORANGE else 1, settings, work)
+    offer_epoch(state, aids, first, end, 0 if aids[first].stream == Stream.PSEUDORANGE else 1, settings, work)
     note_jump(state, position, heading, settings)
 
 
@@ -217,8 +205,8 @@ def offer_epoch(state, aids, first, end, which, settings, work):
         start(state, aids, first, end, settings, work)
     if state.level_known == 0 or state.position_known == 0:
         for i in range(first, end):
-            if aids[i].verdict == WAITING:
-                aids[i].verdict = BEFORE_ALIGNMENT
+            if aids[i].verdict == Verdict.WAITING:
+                aids[i].verdict = Verdict.BEFORE_ALIGNMENT
         return
     join_offsets(state, aids, first, end, settings)
     gather(state, aids, first, end, settings, work)
@@ -232,15 +220,15 @@ def offer_epoch(state, aids, first, end, which, settings, work):
         inflate_or_reset_by_majority(state, aids, first, end, which, settings, work)
     fused = 0
     for i in range(first, end):
-        if aids[i].verdict == WAITING:
+        if aids[i].verdict == Verdict.WAITING:
             fuse_signal(state, aids[i], settings, work)
-            if aids[i].verdict in (FUSED, WEIGHED_DOWN):
+            if aids[i].verdict in (Verdict.FUSED, Verdict.WEIGHED_DOWN):
                 fused += 1
                 mag.note_field(state, aids[i], FIELD)
     if which == 0 and fused >= FEWEST_TO_SOLVE:
-        note_epoch(state, FUSED)
+        note_epoch(state, Verdict.FUSED)
     elif which == 0 and work.signal_count >= FEWEST_TO_JUDGE and 2 * fused < work.signal_count:
-        note_epoch(state, GATE)
+        note_epoch(state, Verdict.GATE)
 
 
 @njit
@@ -249,14 +237,14 @@ def join_offsets(state, aids, first, end, settings):
     join(state, settings.clock_at + 2, settings)
     for i in range(first, end):
         place = offset_place(system_of(aids[i].source), settings)
-        if aids[i].verdict == WAITING and place < len(state.covariance):
+        if aids[i].verdict == Verdict.WAITING and place < len(state.covariance):
             join(state, place + 1, settings)
 
 
 @njit
 def linearize(state, aid, settings, work):
     """Write innovation, Jacobian and noise of one signal to ``work``; return 1, or 0 below the elevation mask."""
-    if aid.stream == PSEUDORANGE:
+    if aid.stream == Stream.PSEUDORANGE:
         return pseudorange.linearize(state, aid.payload, aid.source, settings, work)
     return range_rate.linearize(state, aid.payload, settings, work)
 
@@ -265,16 +253,16 @@ def linearize(state, aid, settings, work):
 def fuse_signal(state, aid, settings, work):
     """Offer one signal to the state: in full, weighed down, or not at all."""
     if linearize(state, aid, settings, work) == 0:
-        aid.verdict = LOW_ELEVATION
+        aid.verdict = Verdict.LOW_ELEVATION
         return
     gate = settings.gate[aid.stream, 1]
     aid.dof = 1
     aid.innovation[0] = work.innovation[0]
     aid.verdict, aid.nis = update(state, 1, min(gate, HUBER * HUBER), work)
-    if aid.verdict == GATE and aid.nis <= gate:
+    if aid.verdict == Verdict.GATE and aid.nis <= gate:
         work.noise[0, 0] *= math.sqrt(aid.nis) / HUBER
         update(state, 1, math.inf, work)
-        aid.verdict = WEIGHED_DOWN
+        aid.verdict = Verdict.WEIGHED_DOWN
 
 
 @njit
@@ -286,10 +274,10 @@ def gather(state, aids, first, end, settings, work):
     """
     count = 0
     for i in range(first, end):
-        if aids[i].verdict != WAITING or count == LARGEST_EPOCH:
+        if aids[i].verdict != Verdict.WAITING or count == LARGEST_EPOCH:
             continue
         if linearize(state, aids[i], settings, work) == 0:
-            aids[i].verdict = LOW_ELEVATION
+            aids[i].verdict = Verdict.LOW_ELEVATION
             continue
         project(state, 1, work)
         work.signal_index[count] = i
@@ -297,7 +285,7 @@ def gather(state, aids, first, end, settings, work):
         work.signal_spread[count] = work.innovation_covariance[0, 0]
         noise = work.noise[0, 0]
         block = VELOCITY
-        if aids[i].stream == PSEUDORANGE:
+        if aids[i].stream == Stream.PSEUDORANGE:
             block = POSITION
             place = offset_place(system_of(aids[i].source), settings)
             if place < state.error_size:
@@ -410,7 +398,7 @@ def reject_outliers(aids, work):
         square = work.signal_residual[k] ** 2
         if square > OUTLIER**2 * scale:
             aid = aids[work.signal_index[k]]
-            aid.verdict = GATE
+            aid.verdict = Verdict.GATE
             aid.dof = 1
             aid.nis = square
             aid.innovation[0] = work.signal_innovation[k]
@@ -519,7 +507,7 @@ def note_solution(state, stamp, which, settings, work):
         for i in range(3):
             for j in range(3):
                 work.noise[i, j] = work.normal[i, j]
-        stream = PSEUDORANGE if which == 0 else RANGE_RATE
+        stream = Stream.PSEUDORANGE if which == 0 else Stream.RANGE_RATE
         search_with(state, 2 * which, measured, lever, settings.gate[stream, 3], settings, work)
 
 
@@ -528,7 +516,7 @@ def gather_coarsely(aids, first, end, position, which, std, work):
     """As `gather`, in ECEF axes, for an antenna at rest at ``position`` (m): no state, no atmosphere, equal noise."""
     count = 0
     for i in range(first, end):
-        if aids[i].verdict != WAITING or count == LARGEST_EPOCH:
+        if aids[i].verdict != Verdict.WAITING or count == LARGEST_EPOCH:
             continue
         payload = aids[i].payload
         unit, length, rate = see(payload, position, (0.0, 0.0, 0.0))
@@ -546,7 +534,7 @@ def locate_coarsely(aids, first, end, work):
     """Return whether the pseudoranges of an epoch give a position, and that (ECEF, to some ten m)."""
     x, y, z = 0.0, 0.0, 0.0
     for i in range(first, end):
-        if aids[i].verdict == WAITING:
+        if aids[i].verdict == Verdict.WAITING:
             x += aids[i].payload[SATELLITE]
             y += aids[i].payload[SATELLITE + 1]
             z += aids[i].payload[SATELLITE + 2]

@@ -38,25 +38,6 @@ from eskf_ros.filter.optional import reset_augmented
 from eskf_ros.filter.track import is_contradicted, is_fusing, is_live, offset_of_track, patience
 from eskf_ros.filter.update import project, update
 
-GNSS_POSITION = int(Stream.GNSS_POSITION)
-GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
-HEADING = int(Stream.HEADING)
-BARO = int(Stream.BARO)
-PSEUDORANGE = int(Stream.PSEUDORANGE)
-
-FUSED = int(Verdict.FUSED)
-GATE = int(Verdict.GATE)
-WEIGHED_DOWN = int(Verdict.WEIGHED_DOWN)
-CONTRADICTED = int(Verdict.CONTRADICTED)
-RESET = int(Verdict.RESET)
-
-PHASE_WAITING = int(Phase.WAITING)
-PHASE_FUSING = int(Phase.FUSING)
-PHASE_SUSPICIOUS = int(Phase.SUSPICIOUS)
-PHASE_OUTAGE = int(Phase.OUTAGE)
-PHASE_REACQUIRING = int(Phase.REACQUIRING)
-PHASE_RESET = int(Phase.RESET)
-
 MEMBERS = 5
 LEAST_SUPPORT = 1_000_000_000
 FULL_SUPPORT = 10_000_000_000
@@ -92,7 +73,7 @@ SAME_SOLUTION = 4.0
 @njit
 def reset_for_new_solution(state, aid, settings):
     """Begin again with what was learnt of the errors of the fixes when the receiver changes its kind of solution."""
-    if aid.stream != GNSS_POSITION:
+    if aid.stream != Stream.GNSS_POSITION:
         return
     variance = aid.payload[3] + aid.payload[6]
     last = state.last_fix_variance[aid.source]
@@ -107,23 +88,23 @@ def reset_for_new_solution(state, aid, settings):
 def phase_of(state, stream, source):
     """Return the phase of an aid at the stamp of the state."""
     if state.aid_stamp[stream, source] == NEVER:
-        return PHASE_WAITING
+        return Phase.WAITING
     if not is_live(state, stream, source):
-        return PHASE_OUTAGE
+        return Phase.OUTAGE
     if not is_fusing(state, stream, source):
-        return PHASE_REACQUIRING
+        return Phase.REACQUIRING
     if state.aid_rejected[stream, source] > 0:
-        return PHASE_SUSPICIOUS
+        return Phase.SUSPICIOUS
     if state.aid_fused_stamp[stream, source] - state.aid_fused_since[stream, source] < FULL_SUPPORT:
-        is_after_reset = stream == GNSS_POSITION and state.reset_stamp == state.aid_fused_since[stream, source]
-        return PHASE_RESET if is_after_reset else PHASE_REACQUIRING
-    return PHASE_FUSING
+        is_after_reset = stream == Stream.GNSS_POSITION and state.reset_stamp == state.aid_fused_since[stream, source]
+        return Phase.RESET if is_after_reset else Phase.REACQUIRING
+    return Phase.FUSING
 
 
 @njit
 def gate_of(state, aid, size, settings):
     """Return the largest normalised innovation squared that is accepted."""
-    if aid.stream == GNSS_POSITION and is_contradicted(state, aid.source):
+    if aid.stream == Stream.GNSS_POSITION and is_contradicted(state, aid.source):
         return NOTHING_PASSES
     return settings.gate[aid.stream, size]
 
@@ -139,32 +120,32 @@ def recover(state, aid, size, gate, settings, work):
     stream, source = aid.stream, aid.source
     if stream >= SENSOR_STREAMS:
         return
-    if stream == GNSS_POSITION and gate == NOTHING_PASSES:
-        aid.verdict = CONTRADICTED
-    elif stream == GNSS_POSITION and aid.verdict == GATE:
+    if stream == Stream.GNSS_POSITION and gate == NOTHING_PASSES:
+        aid.verdict = Verdict.CONTRADICTED
+    elif stream == Stream.GNSS_POSITION and aid.verdict == Verdict.GATE:
         if has_won(state, source):
             reset(state, source, settings, work)
-            aid.verdict = RESET
+            aid.verdict = Verdict.RESET
         elif aid.nis <= NEAR_GATE * gate:
             update_weighed_down(state, size, aid.nis / gate, work)
-            aid.verdict = WEIGHED_DOWN
-    elif stream == HEADING and aid.verdict == GATE and update_refutation(state, aid, settings, work):
+            aid.verdict = Verdict.WEIGHED_DOWN
+    elif stream == Stream.HEADING and aid.verdict == Verdict.GATE and update_refutation(state, aid, settings, work):
         if reset_given_heading(state, aid, settings, work):
-            aid.verdict = RESET
-    elif stream == HEADING and aid.verdict == FUSED:
+            aid.verdict = Verdict.RESET
+    elif stream == Stream.HEADING and aid.verdict == Verdict.FUSED:
         state.heading_disputed = 0
     is_lasting = state.stamp - state.aid_fused_stamp[stream, source] > REJECTED_PRESSURE
-    if stream == BARO and aid.verdict == GATE and is_lasting:
+    if stream == Stream.BARO and aid.verdict == Verdict.GATE and is_lasting:
         reset_augmented(state, settings.baro_offset_at, 1, settings)
     note(state, stream, source, aid.verdict)
-    if stream == GNSS_POSITION and is_lost(state):
+    if stream == Stream.GNSS_POSITION and is_lost(state):
         restart(state)
 
 
 @njit
 def note_epoch(state, verdict):
     """Note what became of most pseudoranges of an epoch."""
-    note(state, PSEUDORANGE, 0, verdict)
+    note(state, Stream.PSEUDORANGE, 0, verdict)
     if is_lost(state):
         restart(state)
 
@@ -187,12 +168,12 @@ def note(state, stream, source, verdict):
         interval = state.aid_interval[stream, source]
         passed = state.stamp - last
         state.aid_interval[stream, source] = passed if interval == 0 else min(passed, 2 * interval)
-    if verdict in (FUSED, RESET):
-        if verdict == RESET or not is_fusing(state, stream, source):
+    if verdict in (Verdict.FUSED, Verdict.RESET):
+        if verdict == Verdict.RESET or not is_fusing(state, stream, source):
             state.aid_fused_since[stream, source] = state.stamp
         state.aid_fused_stamp[stream, source] = state.stamp
         state.aid_rejected[stream, source] = 0
-        if stream in (GNSS_POSITION, PSEUDORANGE):
+        if stream in (Stream.GNSS_POSITION, Stream.PSEUDORANGE):
             if state.absolute_stamp != NEVER:
                 state.absolute_interval = state.stamp - state.absolute_stamp
             state.absolute_stamp = state.stamp
@@ -201,12 +182,12 @@ def note(state, stream, source, verdict):
                 state.track_rejected[k] = 0
     else:
         state.aid_rejected[stream, source] += 1
-        if stream in (GNSS_POSITION, PSEUDORANGE):
+        if stream in (Stream.GNSS_POSITION, Stream.PSEUDORANGE):
             if state.rejected_fixes == 0:
                 state.rejected_since = state.stamp
             state.rejected_fixes += 1
-        if stream == GNSS_POSITION:
-            if verdict == CONTRADICTED:
+        if stream == Stream.GNSS_POSITION:
+            if verdict == Verdict.CONTRADICTED:
                 state.track_rejected[source] = 0
             elif state.track_misses[source] == 0:
                 if state.track_rejected[source] == 0:
@@ -222,8 +203,8 @@ def has_won(state, source):
         return False
     since, last = state.track_rejected_since[source], state.absolute_stamp
     needed = LEAST_SUPPORT
-    if last != NEVER and since - last <= patience(state, GNSS_POSITION, source):
-        support = last - state.aid_fused_since[GNSS_POSITION, source]
+    if last != NEVER and since - last <= patience(state, Stream.GNSS_POSITION, source):
+        support = last - state.aid_fused_since[Stream.GNSS_POSITION, source]
         needed = min(max(support, LEAST_SUPPORT), FULL_SUPPORT)
         if needed == FULL_SUPPORT and is_against_inertial(state, source):
             needed = AGAINST_INERTIAL
@@ -233,8 +214,8 @@ def has_won(state, source):
 @njit
 def is_against_inertial(state, source):
     """Say whether a receiver contradicts the filter in velocity too, in which the IMU has its say."""
-    if is_live(state, GNSS_VELOCITY, source):
-        return not is_fusing(state, GNSS_VELOCITY, source)
+    if is_live(state, Stream.GNSS_VELOCITY, source):
+        return not is_fusing(state, Stream.GNSS_VELOCITY, source)
     for i in range(3):
         known = state.track_rate_variance[source, i] + state.covariance[VELOCITY + i, VELOCITY + i]
         if state.track_rate[source, i] ** 2 > INERTIAL_SIGMAS**2 * known:
@@ -256,9 +237,9 @@ def reset(state, source, settings, work):
     for i in range(3):
         state.position_map[i] += offset_of_track(state, source, i)
         covariance[POSITION + i, POSITION + i] = max(state.track_offset_variance[source, i], whole * work.noise[i, i])
-    if not is_fusing(state, GNSS_VELOCITY, source):
+    if not is_fusing(state, Stream.GNSS_VELOCITY, source):
         forget_error(covariance, VELOCITY)
-        is_led = is_live(state, GNSS_VELOCITY, source)
+        is_led = is_live(state, Stream.GNSS_VELOCITY, source)
         for i in range(3):
             p, v = POSITION + i, VELOCITY + i
             covariance[v, v] = START_VELOCITY_STD**2
@@ -292,5 +273,5 @@ def is_lost(state):
         return not is_new
     since = state.rejected_since
     for source in range(SOURCES):
-        since = max(since, state.aid_fused_stamp[GNSS_VELOCITY, source])
+        since = max(since, state.aid_fused_stamp[Stream.GNSS_VELOCITY, source])
     return state.rejected_fixes >= MEMBERS and state.stamp - since >= LAST_RESORT

@@ -23,13 +23,6 @@ from eskf_ros.filter.layout import CONSTRAINT_INTERVAL, NEVER, SOURCES, VELOCITY
 from eskf_ros.filter.still_window import reset_level_when_moving
 from eskf_ros.rotation import dot
 
-GNSS_POSITION = int(Stream.GNSS_POSITION)
-GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
-WHEEL = int(Stream.WHEEL)
-BODY_VELOCITY = int(Stream.BODY_VELOCITY)
-BARO = int(Stream.BARO)
-GATE = int(Verdict.GATE)
-
 FEWEST_SAMPLES = 3
 """Of fewer samples in half an interval the spread says nothing."""
 
@@ -218,17 +211,17 @@ def is_resting(state, settings):
 def update_rest_evidence(state, aid, settings):
     """Look at a measurement of any sensor for rest or motion, whatever the filter will make of it."""
     p = aid.payload
-    if aid.stream == GNSS_POSITION:
+    if aid.stream == Stream.GNSS_POSITION:
         note_displacement(state, aid)
-    elif aid.stream == GNSS_VELOCITY:
+    elif aid.stream == Stream.GNSS_VELOCITY:
         weigh_speed(
             state, aid.stamp, math.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2), math.sqrt(max(p[3], p[6], p[8])), True
         )
-    elif aid.stream == BODY_VELOCITY:
+    elif aid.stream == Stream.BODY_VELOCITY:
         speed, std = math.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2), math.sqrt(max(p[3], p[6], p[8]))
         weigh_speed(state, aid.stamp, speed, std, min(p[3], p[6], p[8]) > 0.0)
         reset_level_when_moving(state, speed - REST_SIGMAS * std, aid.stamp, aid.stamp, settings)
-    elif aid.stream == WHEEL:
+    elif aid.stream == Stream.WHEEL:
         if abs(p[0]) < STANDING_SPEED and abs(p[1]) < STANDING_YAW_RATE:
             if p[3] > 0.0:
                 state.resting_stamp = aid.stamp
@@ -237,7 +230,7 @@ def update_rest_evidence(state, aid, settings):
             reset_level_when_moving(
                 state, abs(p[0]) - REST_SIGMAS * math.sqrt(max(p[3], 0.0)), aid.stamp, aid.stamp, settings
             )
-    elif aid.stream == BARO:
+    elif aid.stream == Stream.BARO:
         note_pressure(state, aid)
 
 
@@ -286,5 +279,5 @@ def note_pressure(state, aid):
 def watch_wheels(state, aid):
     """Note when the wheels spoke, and when the gate refused to believe them: they slip."""
     state.wheel_stamp = aid.stamp
-    if aid.verdict == GATE:
+    if aid.verdict == Verdict.GATE:
         state.slip_stamp = aid.stamp

@@ -18,15 +18,7 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.layout import CONSTRAINT_INTERVAL, CONSTRAINTS, NEVER, Verdict, allocate
-
-WAITING = int(Verdict.WAITING)
-BAD_STAMP = int(Verdict.BAD_STAMP)
-DUPLICATE = int(Verdict.DUPLICATE)
-BEFORE_ALIGNMENT = int(Verdict.BEFORE_ALIGNMENT)
-OUTSIDE_HISTORY = int(Verdict.OUTSIDE_HISTORY)
-INACTIVE = int(Verdict.INACTIVE)
-FIRST_CONSTRAINT = int(min(CONSTRAINTS))
+from eskf_ros.filter.layout import CONSTRAINT_INTERVAL, NEVER, SENSOR_STREAMS, Verdict, allocate
 
 EARLY_AIDS = 4096
 """So many aids may wait for the first IMU sample."""
@@ -129,7 +121,7 @@ def begin_again(aids, timeline):
     """Take back all IMU samples: the next advance starts from the blank state, with the aids that sensors sent."""
     kept = timeline.recorded
     for i in range(timeline.recorded, timeline.aid_count):
-        if aids[i].stream < FIRST_CONSTRAINT:
+        if aids[i].stream < SENSOR_STREAMS:
             aids[kept] = aids[i]
             kept += 1
     timeline.aid_count = kept
@@ -210,7 +202,7 @@ def add_constraints(aids, t, settings, after, until, gap):
         return
     point = (after // CONSTRAINT_INTERVAL + 1) * CONSTRAINT_INTERVAL
     while point <= until:
-        for stream in range(FIRST_CONSTRAINT, len(settings.constrains)):
+        for stream in range(SENSOR_STREAMS, len(settings.constrains)):
             if settings.constrains[stream] == 1:
                 add_constraint(aids, t, stream, point)
         point += CONSTRAINT_INTERVAL
@@ -231,8 +223,8 @@ def add_constraint(aids, t, stream, stamp):
     aid.arrival = stamp
     aid.stream = stream
     aid.source = 0
-    aid.door = WAITING
-    aid.verdict = WAITING
+    aid.door = Verdict.WAITING
+    aid.verdict = Verdict.WAITING
     aid.dof = 0
     aid.told = 0
     for i in range(len(aid.payload)):
@@ -291,12 +283,12 @@ def insert_aid(aids, timeline, offered):
     t = timeline[0]
     aid = offered[0]
     if aid.stamp <= 0 or (t.frontier != NEVER and aid.stamp > t.frontier + LARGEST_JUMP):
-        return BAD_STAMP
+        return Verdict.BAD_STAMP
     if t.frontier == NEVER and t.aid_count >= EARLY_AIDS:
-        return BEFORE_ALIGNMENT
+        return Verdict.BEFORE_ALIGNMENT
     if t.frontier != NEVER and aid.stamp < oldest_in_time(t):
         t.furthest_late = max(t.furthest_late, t.frontier - aid.stamp)
-        return OUTSIDE_HISTORY
+        return Verdict.OUTSIDE_HISTORY
     place = t.aid_count
     while place > 0 and comes_before(aid, aids[place - 1]):
         place -= 1
@@ -305,7 +297,7 @@ def insert_aid(aids, timeline, offered):
     aids[place] = aid
     t.aid_count += 1
     go_back_to(t, aid.stamp)
-    return WAITING
+    return Verdict.WAITING
 
 
 @njit
@@ -327,10 +319,10 @@ def open_record(aids, i):
     aid.dof = 0
     for k in range(3):
         aid.innovation[k] = math.nan
-    if aid.door != WAITING:
+    if aid.door != Verdict.WAITING:
         return False
     if is_duplicate(aids, i):
-        aid.verdict = DUPLICATE
+        aid.verdict = Verdict.DUPLICATE
         return False
     return True
 
@@ -393,7 +385,7 @@ def take_final(aids, timeline, out, everything):
         aid = aids[t.recorded]
         if not everything and (t.frontier == NEVER or aid.stamp >= t.frontier - t.window):
             break
-        if aid.verdict == INACTIVE:
+        if aid.verdict == Verdict.INACTIVE:
             t.recorded += 1
             continue
         out[count].stamp = aid.stamp

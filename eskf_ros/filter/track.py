@@ -15,9 +15,6 @@ from eskf_ros.compiled import njit
 from eskf_ros.filter.aiding.gnss_position import noise_factor
 from eskf_ros.filter.layout import NEVER, POSITION, SOURCES, Stream
 
-GNSS_POSITION = int(Stream.GNSS_POSITION)
-GNSS_VELOCITY = int(Stream.GNSS_VELOCITY)
-
 SHORTEST_PATIENCE = 1_000_000_000
 LONGEST_PATIENCE = 30_000_000_000
 MISSED_INTERVALS = 2.5
@@ -81,16 +78,16 @@ def is_fusing(state, stream, source):
 @njit
 def is_led(state, source):
     """Say whether velocities of a receiver come often enough to lead the track of its fixes."""
-    last = state.aid_stamp[GNSS_VELOCITY, source]
+    last = state.aid_stamp[Stream.GNSS_VELOCITY, source]
     return last != NEVER and state.stamp - last <= LONGEST_LEAD
 
 
 @njit
 def update_track(state, aid, work):
     """Show the track of a receiver its newest measurement, whose innovation and noise are in ``work``."""
-    if aid.stream == GNSS_POSITION:
+    if aid.stream == Stream.GNSS_POSITION:
         take_fix(state, aid.source, work)
-    elif aid.stream == GNSS_VELOCITY:
+    elif aid.stream == Stream.GNSS_VELOCITY:
         take_velocity(state, aid.source, work)
 
 
@@ -100,7 +97,7 @@ def take_velocity(state, source, work):
     if not is_led(state, source):
         forget_rate(state, source)
         return
-    dt = (state.stamp - state.aid_stamp[GNSS_VELOCITY, source]) * 1e-9
+    dt = (state.stamp - state.aid_stamp[Stream.GNSS_VELOCITY, source]) * 1e-9
     for i in range(3):
         state.velocity_lead[source, i] += work.innovation[i] * dt
         state.velocity_lead_variance[source, i] += work.noise[i, i] * dt * dt
@@ -110,7 +107,7 @@ def take_velocity(state, source, work):
 def take_fix(state, source, work):
     """Let the track take a fix, if it belongs to it."""
     last = state.track_stamp[source]
-    if last == NEVER or state.stamp - last > patience(state, GNSS_POSITION, source):
+    if last == NEVER or state.stamp - last > patience(state, Stream.GNSS_POSITION, source):
         start_track(state, source, work)
         return
     nis = predict_track(state, source, work)

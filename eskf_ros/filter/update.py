@@ -11,10 +11,6 @@ from eskf_ros.filter.covariance import transform_error
 from eskf_ros.filter.layout import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, VELOCITY, Verdict
 from eskf_ros.rotation import from_rotation_vector, left_jacobian, multiply, normalized
 
-FUSED = int(Verdict.FUSED)
-GATE = int(Verdict.GATE)
-BAD_COVARIANCE = int(Verdict.BAD_COVARIANCE)
-
 
 @njit
 def update(state, size, gate, work):
@@ -28,14 +24,14 @@ def update(state, size, gate, work):
     """
     project(state, size, work)
     if not invert_positive(work.innovation_covariance, size):
-        return BAD_COVARIANCE, np.nan
+        return Verdict.BAD_COVARIANCE, np.nan
     inverse = work.innovation_covariance
     nis = 0.0
     for a in range(size):
         for b in range(size):
             nis += work.innovation[a] * inverse[a, b] * work.innovation[b]
     if not nis <= gate:
-        return GATE, nis
+        return Verdict.GATE, nis
     for i in range(state.error_size):
         correction = 0.0
         for a in range(size):
@@ -50,7 +46,7 @@ def update(state, size, gate, work):
     # The error is now about the injected attitude (Sola, section 6.3.1, with the full Jacobian).
     turn = (work.correction[ATTITUDE], work.correction[ATTITUDE + 1], work.correction[ATTITUDE + 2])
     transform_error(state.covariance, ATTITUDE, left_jacobian(turn))
-    return FUSED, nis
+    return Verdict.FUSED, nis
 
 
 @njit

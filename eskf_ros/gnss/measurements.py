@@ -94,11 +94,6 @@ class Masks(NamedTuple):
 
 DEFAULT_MASKS = Masks()
 
-_USABLE = int(Status.USABLE)
-_BAD_VALUE = int(Status.BAD_VALUE)
-_NOT_LOCATED = int(Status.NOT_LOCATED)
-_LOW_ELEVATION = int(Status.LOW_ELEVATION)
-
 
 def measured_epoch(
     ranges: NDArray[np.void],
@@ -142,7 +137,7 @@ def measure(ranges, week, seconds, receiver, records, first, ionosphere, weighti
     known = not math.isnan(receiver[0] + receiver[1] + receiver[2])
     for k in range(len(ranges)):
         observed = ranges[k]
-        if observed["status"] == _NOT_LOCATED or observed["status"] == _USABLE:
+        if observed["status"] == Status.NOT_LOCATED or observed["status"] == Status.USABLE:
             locate_one(observed, week, seconds, records, first)
         clear(observed, measured[k])
     if known:
@@ -175,8 +170,8 @@ def clear(observed, signal):
         flags &= ~DOPPLER_VALID
     signal["flags"] = flags
     signal["status"] = observed["status"]
-    if signal["status"] == _USABLE and not flags & (CODE_VALID | DOPPLER_VALID):
-        signal["status"] = _BAD_VALUE
+    if signal["status"] == Status.USABLE and not flags & (CODE_VALID | DOPPLER_VALID):
+        signal["status"] = Status.BAD_VALUE
 
 
 @njit
@@ -187,7 +182,7 @@ def at_receiver(measured, receiver, week, seconds, ionosphere, weighting):
     prediction = np.zeros(1, PREDICTION)[0]
     for k in range(len(measured)):
         signal = measured[k]
-        if signal["status"] != _USABLE:
+        if signal["status"] != Status.USABLE:
             continue
         if not signal["flags"] & ALREADY_TURNED:
             turn(signal, receiver)
@@ -230,8 +225,8 @@ def choose_signals(measured, masks):
     """
     leave_out_weak(measured, masks.cn0)
     for k in range(len(measured)):
-        if measured[k]["status"] == _USABLE and measured[k]["elevation"] < masks.elevation:
-            measured[k]["status"] = _LOW_ELEVATION
+        if measured[k]["status"] == Status.USABLE and measured[k]["elevation"] < masks.elevation:
+            measured[k]["status"] = Status.LOW_ELEVATION
     return choose_per_satellite(measured, masks.one_per_satellite)
 
 

@@ -16,11 +16,6 @@ from eskf_ros.compiled import njit
 from eskf_ros.gnss.signals import SPEED_OF_LIGHT, Gnss, is_beidou_geostationary
 from eskf_ros.gnss.time import elapsed
 
-GPS = int(Gnss.GPS)
-QZSS = int(Gnss.QZSS)
-BEIDOU = int(Gnss.BEIDOU)
-GLONASS = int(Gnss.GLONASS)
-
 # Gravitational parameter (m3/s2) and Earth rate (rad/s) are part of each broadcast model, hence not those of WGS84:
 # IS-GPS-200N, table 20-IV; OS-SIS-ICD 2.1, section 5.1.1; BDS-SIS-ICD-B1I 3.0, section 5.2.4; GLONASS ICD 5.1, A.3.1.2.
 GRAVITY_GPS = 3.986005e14
@@ -45,7 +40,7 @@ def satellite_state(ephemeris, week, seconds):
     Two tuples of three and two floats: ECEF of that instant, see above. ``ephemeris``: a record of EPHEMERIS.
     """
     time = elapsed(week, seconds, ephemeris["toe_week"], ephemeris["toe"])
-    if ephemeris["gnss_id"] == GLONASS:
+    if ephemeris["gnss_id"] == Gnss.GLONASS:
         position, velocity = integrated_orbit(ephemeris, time)
         relativity, relativity_rate = 0.0, 0.0
     else:
@@ -89,8 +84,8 @@ def kepler_orbit(ephemeris, time):
     The velocity is the analytic derivative, harmonics included.
     """
     gnss = ephemeris["gnss_id"]
-    gravity = GRAVITY_GPS if gnss in (GPS, QZSS) else GRAVITY
-    earth_rate = RATE_BEIDOU if gnss == BEIDOU else RATE
+    gravity = GRAVITY_GPS if gnss in (Gnss.GPS, Gnss.QZSS) else GRAVITY
+    earth_rate = RATE_BEIDOU if gnss == Gnss.BEIDOU else RATE
     eccentricity = ephemeris["e"]
     sqrt_axis = ephemeris["sqrt_a"]
     axis_at_toe = sqrt_axis * sqrt_axis

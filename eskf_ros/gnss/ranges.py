@@ -119,20 +119,7 @@ HIGHEST_CN0 = 100.0
 DEFAULT_CN0_MASK = 28.0
 """dB-Hz: below it a signal is hardly tracked."""
 
-_UNKNOWN_SIGNAL = int(Status.UNKNOWN_SIGNAL)
-_BAD_VALUE = int(Status.BAD_VALUE)
-_NO_EPHEMERIS = int(Status.NO_EPHEMERIS)
-_STALE = int(Status.STALE)
-_UNHEALTHY = int(Status.UNHEALTHY)
-_NO_GROUP_DELAY = int(Status.NO_GROUP_DELAY)
-_BAD_EPHEMERIS = int(Status.BAD_EPHEMERIS)
-_USABLE = int(Status.USABLE)
-_WRONG_WEEK = int(Status.WRONG_WEEK)
 _LOW_CN0 = int(Status.LOW_CN0)
-_DUPLICATE = int(Status.DUPLICATE)
-_OTHER_SIGNAL = int(Status.OTHER_SIGNAL)
-_OTHER_BAND = int(Status.OTHER_BAND)
-_GLONASS = int(Gnss.GLONASS)
 _SIGNAL_COUNT = len(SIGNALS)
 
 
@@ -218,7 +205,7 @@ def ionosphere_free(ranges: NDArray[np.void]) -> NDArray[np.void]:
 def leave_out_weak(signals, cn0_mask):
     """Set the status of usable signals (RANGE, MEASURED_SIGNAL) with a C/N0 below the mask; an unknown one passes."""
     for k in range(len(signals)):
-        if signals[k]["status"] == _USABLE and signals[k]["cn0"] < cn0_mask:
+        if signals[k]["status"] == Status.USABLE and signals[k]["cn0"] < cn0_mask:
             signals[k]["status"] = _LOW_CN0
 
 
@@ -233,12 +220,12 @@ def choose_per_satellite(signals, one_of_each):
     The flags say what a signal is left to give. Of equal signals the first to come counts.
     """
     for k in range(len(signals)):
-        if signals[k]["status"] == _USABLE and is_double(signals, k):
-            signals[k]["status"] = _DUPLICATE
+        if signals[k]["status"] == Status.USABLE and is_double(signals, k):
+            signals[k]["status"] = Status.DUPLICATE
     given = np.zeros(len(signals), np.int64)
-    unused = np.full(len(signals), _OTHER_SIGNAL)
+    unused = np.full(len(signals), Status.OTHER_SIGNAL)
     for k in range(len(signals)):
-        if signals[k]["status"] != _USABLE:
+        if signals[k]["status"] != Status.USABLE:
             continue
         code, doppler = first_of_satellite(signals, k, CODE_VALID), first_of_satellite(signals, k, DOPPLER_VALID)
         if code >= 0 and gives(signals[code], DOPPLER_VALID):
@@ -247,10 +234,10 @@ def choose_per_satellite(signals, one_of_each):
             if k == chosen or (not one_of_each and gives(signals[k], flag)):
                 given[k] |= flag
         if code < 0 and doppler < 0:
-            unused[k] = _OTHER_BAND
+            unused[k] = Status.OTHER_BAND
     count = 0
     for k in range(len(signals)):
-        if signals[k]["status"] != _USABLE:
+        if signals[k]["status"] != Status.USABLE:
             continue
         if given[k]:
             signals[k]["flags"] &= ~(CODE_VALID | DOPPLER_VALID) | given[k]
@@ -267,7 +254,7 @@ def is_double(signals, k):
     for earlier in range(k):
         other = signals[earlier]
         if (
-            other["status"] == _USABLE
+            other["status"] == Status.USABLE
             and of_one_satellite(other, signal)
             and other["signal"] == signal["signal"]
             and not abs(other["carrier_hz"] - signal["carrier_hz"]) > 1.0
@@ -301,7 +288,7 @@ def first_of_satellite(signals, k, flag):
     first = -1
     for other in range(len(signals)):
         rival = signals[other]
-        if rival["status"] != _USABLE or not of_one_satellite(rival, signals[k]) or not gives(rival, flag):
+        if rival["status"] != Status.USABLE or not of_one_satellite(rival, signals[k]) or not gives(rival, flag):
             continue
         if first < 0 or precedes(rival, signals[first]):
             first = other
@@ -341,12 +328,12 @@ def locate_one(observed, week, seconds, records, first):
         observed["doppler_std"] = math.nan
     if not LOWEST_CARRIER_HZ < observed["carrier_hz"] < HIGHEST_CARRIER_HZ:
         # The channel of a GLONASS satellite moves the range rate by metres per second: without it no Doppler.
-        observed["carrier_hz"] = SIGNAL_CARRIER_HZ[signal] if known_signal and gnss != _GLONASS else math.nan
+        observed["carrier_hz"] = SIGNAL_CARRIER_HZ[signal] if known_signal and gnss != Gnss.GLONASS else math.nan
     if observed["flags"] & CLOCK_APPLIED:
         observed["satellite_clock"] = 0.0
     if not 0 <= gnss < GNSS_COUNT or not IS_CONSTELLATION[gnss]:
         # It is an index into tables of constellations; a satellite of no system here has a time of its own.
-        observed["status"] = _UNKNOWN_SIGNAL
+        observed["status"] = Status.UNKNOWN_SIGNAL
         return
     if math.isnan(observed["satellite_clock"]):
         # A position alone is no satellite state: without its clock a range is 100 km off. The ephemerides have both.
@@ -359,19 +346,19 @@ def locate_one(observed, week, seconds, records, first):
             observed["flags"] &= ~DOPPLER_VALID
             for axis in range(3):
                 velocity[axis] = 0.0
-        observed["status"] = _USABLE if satellite_is_possible(observed) else _BAD_VALUE
+        observed["status"] = Status.USABLE if satellite_is_possible(observed) else Status.BAD_VALUE
         return
     if not known_signal:
-        observed["status"] = _UNKNOWN_SIGNAL
+        observed["status"] = Status.UNKNOWN_SIGNAL
         return
     if not observed["flags"] & CODE_VALID or not 0.0 <= seconds < SECONDS_PER_WEEK:
-        observed["status"] = _BAD_VALUE
+        observed["status"] = Status.BAD_VALUE
         return
     slot = SIGNAL_SLOT[signal]
     chosen, reason = choose(records, first, gnss, sv_id, slot, week, seconds, NO_ISSUE)
     if chosen < 0:
-        if reason == _STALE and fits_another_week(records, first, gnss, sv_id, week, seconds):
-            reason = _WRONG_WEEK
+        if reason == Status.STALE and fits_another_week(records, first, gnss, sv_id, week, seconds):
+            reason = Status.WRONG_WEEK
         observed["status"] = reason
         return
     ephemeris = records[chosen]
@@ -387,14 +374,14 @@ def locate_one(observed, week, seconds, records, first):
         observed["satellite_clock"] = clock - ephemeris["group_delay"][slot]
     observed["satellite_clock_drift"] = drift
     observed["issue"] = ephemeris["issue"]
-    if gnss == _GLONASS:
+    if gnss == Gnss.GLONASS:
         carrier = carrier_hz(signal, ephemeris["channel"])
         observed["carrier_hz"] = carrier if LOWEST_CARRIER_HZ < carrier < HIGHEST_CARRIER_HZ else math.nan
     if not satellite_is_possible(observed):
-        observed["status"] = _BAD_EPHEMERIS
+        observed["status"] = Status.BAD_EPHEMERIS
         return
     observed["flags"] |= SATELLITE_KNOWN
-    observed["status"] = _USABLE
+    observed["status"] = Status.USABLE
 
 
 @njit
@@ -423,11 +410,11 @@ def choose(records, first, gnss_id, sv_id, slot, week, seconds, issue):
     way around a new warning.
     """
     if not (0 <= gnss_id < GNSS_COUNT and 0 <= sv_id < SATELLITE_KEYS):
-        return -1, _NO_EPHEMERIS
+        return -1, Status.NO_EPHEMERIS
     key = SATELLITE_KEYS * gnss_id + sv_id
     chosen, message, closest, ahead = -1, 0, math.inf, False
     newest, warned = -math.inf, False
-    reason = _NO_EPHEMERIS
+    reason = Status.NO_EPHEMERIS
     for k in range(first[key], first[key + 1]):
         ephemeris = records[k]
         if issue != NO_ISSUE and ephemeris["issue"] != issue:
@@ -435,10 +422,12 @@ def choose(records, first, gnss_id, sv_id, slot, week, seconds, issue):
         since_toe = elapsed(week, seconds, ephemeris["toe_week"], ephemeris["toe"])
         age = since_toe / ephemeris["max_age"] if since_toe > 0.0 else -since_toe / ephemeris["max_lead"]
         if not age <= 1.0:
-            reason = max(reason, _STALE)
+            if reason < Status.STALE:
+                reason = Status.STALE
             continue
         if slot < 0 or math.isnan(ephemeris["group_delay"][slot]):
-            reason = max(reason, _NO_GROUP_DELAY)
+            if reason < Status.NO_GROUP_DELAY:
+                reason = Status.NO_GROUP_DELAY
             continue
         # NaN where it is not known: what the receiver has, has been sent.
         until_sent = elapsed(ephemeris["sent_week"], ephemeris["sent"], week, seconds)
@@ -455,8 +444,8 @@ def choose(records, first, gnss_id, sv_id, slot, week, seconds, issue):
     if chosen < 0:
         return -1, reason
     if warned or (records[chosen]["unhealthy"] >> slot) & 1:
-        return -1, _UNHEALTHY
-    return chosen, _USABLE
+        return -1, Status.UNHEALTHY
+    return chosen, Status.USABLE
 
 
 @njit

@@ -193,7 +193,7 @@ def is_upper_band(signal, carrier):
 @njit
 def is_beidou_geostationary(gnss_id, sv_id):
     """True for the BeiDou satellites whose ephemeris is in a tilted frame (BDS-SIS-ICD-B1I 3.0, section 5.2.4)."""
-    return gnss_id == _BEIDOU and (sv_id <= 5 or sv_id >= 59)
+    return gnss_id == Gnss.BEIDOU and (sv_id <= 5 or sv_id >= 59)
 
 
 @njit
@@ -202,8 +202,7 @@ def time_group(gnss_id, sv_id):
 
     Receivers measure B1I of the two generations 1 to 3 m apart (0.5 ns and more in the filters and the group delays).
     """
-    return BEIDOU_3 if gnss_id == _BEIDOU and sv_id >= _FIRST_BEIDOU_3 else gnss_id
+    return BEIDOU_3 if gnss_id == Gnss.BEIDOU and sv_id >= _FIRST_BEIDOU_3 else gnss_id
 
 
-_BEIDOU = int(Gnss.BEIDOU)
 _FIRST_BEIDOU_3 = 19

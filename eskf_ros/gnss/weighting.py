@@ -38,7 +38,6 @@ class Weighting(NamedTuple):
 
 
 DEFAULT_WEIGHTING = Weighting()
-_GLONASS = int(Gnss.GLONASS)
 
 
 @njit
@@ -53,7 +52,7 @@ def code_std(weighting, gnss_id, sv_id, elevation, cn0, ionosphere, noise_factor
     zenith = weighting.code_zenith / max(LOWEST_SINE, math.sin(elevation))
     noise = weighting.code_noise * 10.0 ** ((40.0 - cn0) / 20.0)
     std = math.sqrt((zenith**2 + noise**2) * noise_factor**2 + (weighting.ionosphere_share * ionosphere) ** 2)
-    if gnss_id == _GLONASS or is_beidou_geostationary(gnss_id, sv_id):
+    if gnss_id == Gnss.GLONASS or is_beidou_geostationary(gnss_id, sv_id):
         return weighting.weak_factor * std
     return std
 

@@ -22,8 +22,6 @@ from eskf_ros.filter.aiding.gnss_velocity import local_east_north_up_to_ecef
 from eskf_ros.filter.layout import ERROR_SIZE, Verdict
 from eskf_ros.rotation import dot, rotate, rotate_back, to_matrix, wrapped
 
-FUSED = int(Verdict.FUSED)
-
 WEAKEST_LEVEL = 2.0e-6
 """Near the magnetic poles the level part of the field (T) tells no heading."""
 
@@ -150,7 +148,7 @@ def propagate_mag_error(state, heading, settings):
 @njit
 def note_field(state, aid, place):
     """Remember the Earth's field at a good fix or range, which carries it from ``place`` of its payload on."""
-    if aid.verdict == FUSED and aid.payload[place] > 0.0:
+    if aid.verdict == Verdict.FUSED and aid.payload[place] > 0.0:
         state.field_declination = aid.payload[place + 1]
         state.field_inclination = aid.payload[place + 2]
         state.field_strength = aid.payload[place + 3]
