@@ -93,7 +93,7 @@ def update_motion_evidence(state, aid, settings):
 def wait_for_alignment(state, aid, settings, work):
     """Leave a measurement that comes too early; wheels help to find the heading before they are fused."""
     if aid.stream == Stream.WHEEL:
-        search_with_wheels(state, aid.payload, settings.gate[Stream.WHEEL, 2], settings, work)
+        search_with_wheels(state, aid.payload, settings.gate[Stream.WHEEL.value, 2], settings, work)
         watch_wheels(state, aid)
     aid.verdict = Verdict.BEFORE_ALIGNMENT if aid.stream < SENSOR_STREAMS else Verdict.INACTIVE
 
@@ -120,7 +120,7 @@ def measure(state, aid, heading_before, settings, work):
         watch_field(state, is_disturbed)
         if is_disturbed:
             aid.verdict = Verdict.GATE
-            note(state, Stream.MAG, aid.source, Verdict.GATE)
+            note(state, Stream.MAG.value, aid.source, Verdict.GATE.value)
             return 0
     size = linearize(state, aid, settings, work)
     if size == UNKNOWN_STREAM:

@@ -100,7 +100,7 @@ def update_refutation(state, aid, settings, work):
     better. So what was given holds only if the antennas are heard to agree with it, and not if those that were rejected
     from the beginning agree with each other.
     """
-    is_doubtful = state.given_stamp != NEVER and state.aid_fused_stamp[Stream.HEADING, 0] < state.given_stamp
+    is_doubtful = state.given_stamp != NEVER and state.aid_fused_stamp[Stream.HEADING.value, 0] < state.given_stamp
     if not is_doubtful or aid.source != 0 or not aid.payload[3] > 0.0:
         return False
     std = math.sqrt(aid.payload[3])
@@ -117,7 +117,7 @@ def reset_given_heading(state, aid, settings, work):
     """
     state.given_stamp = NEVER
     state.hint_count = 0
-    if state.aid_fused_stamp[Stream.HEADING, 0] == NEVER:
+    if state.aid_fused_stamp[Stream.HEADING.value, 0] == NEVER:
         restart(state)
         state.heading_disputed = 1
         return False

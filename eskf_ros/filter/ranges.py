@@ -226,9 +226,9 @@ def offer_epoch(state, aids, first, end, which, settings, work):
                 fused += 1
                 mag.note_field(state, aids[i], FIELD)
     if which == 0 and fused >= FEWEST_TO_SOLVE:
-        note_epoch(state, Verdict.FUSED)
+        note_epoch(state, Verdict.FUSED.value)
     elif which == 0 and work.signal_count >= FEWEST_TO_JUDGE and 2 * fused < work.signal_count:
-        note_epoch(state, Verdict.GATE)
+        note_epoch(state, Verdict.GATE.value)
 
 
 @njit
@@ -507,7 +507,7 @@ def note_solution(state, stamp, which, settings, work):
         for i in range(3):
             for j in range(3):
                 work.noise[i, j] = work.normal[i, j]
-        stream = Stream.PSEUDORANGE if which == 0 else Stream.RANGE_RATE
+        stream = Stream.PSEUDORANGE.value if which == 0 else Stream.RANGE_RATE.value
         search_with(state, 2 * which, measured, lever, settings.gate[stream, 3], settings, work)
 
 

@@ -145,7 +145,7 @@ def recover(state, aid, size, gate, settings, work):
 @njit
 def note_epoch(state, verdict):
     """Note what became of most pseudoranges of an epoch."""
-    note(state, Stream.PSEUDORANGE, 0, verdict)
+    note(state, Stream.PSEUDORANGE.value, 0, verdict)
     if is_lost(state):
         restart(state)
 
@@ -203,8 +203,8 @@ def has_won(state, source):
         return False
     since, last = state.track_rejected_since[source], state.absolute_stamp
     needed = LEAST_SUPPORT
-    if last != NEVER and since - last <= patience(state, Stream.GNSS_POSITION, source):
-        support = last - state.aid_fused_since[Stream.GNSS_POSITION, source]
+    if last != NEVER and since - last <= patience(state, Stream.GNSS_POSITION.value, source):
+        support = last - state.aid_fused_since[Stream.GNSS_POSITION.value, source]
         needed = min(max(support, LEAST_SUPPORT), FULL_SUPPORT)
         if needed == FULL_SUPPORT and is_against_inertial(state, source):
             needed = AGAINST_INERTIAL
@@ -214,8 +214,8 @@ def has_won(state, source):
 @njit
 def is_against_inertial(state, source):
     """Say whether a receiver contradicts the filter in velocity too, in which the IMU has its say."""
-    if is_live(state, Stream.GNSS_VELOCITY, source):
-        return not is_fusing(state, Stream.GNSS_VELOCITY, source)
+    if is_live(state, Stream.GNSS_VELOCITY.value, source):
+        return not is_fusing(state, Stream.GNSS_VELOCITY.value, source)
     for i in range(3):
         known = state.track_rate_variance[source, i] + state.covariance[VELOCITY + i, VELOCITY + i]
         if state.track_rate[source, i] ** 2 > INERTIAL_SIGMAS**2 * known:
@@ -237,9 +237,9 @@ def reset(state, source, settings, work):
     for i in range(3):
         state.position_map[i] += offset_of_track(state, source, i)
         covariance[POSITION + i, POSITION + i] = max(state.track_offset_variance[source, i], whole * work.noise[i, i])
-    if not is_fusing(state, Stream.GNSS_VELOCITY, source):
+    if not is_fusing(state, Stream.GNSS_VELOCITY.value, source):
         forget_error(covariance, VELOCITY)
-        is_led = is_live(state, Stream.GNSS_VELOCITY, source)
+        is_led = is_live(state, Stream.GNSS_VELOCITY.value, source)
         for i in range(3):
             p, v = POSITION + i, VELOCITY + i
             covariance[v, v] = START_VELOCITY_STD**2
@@ -273,5 +273,5 @@ def is_lost(state):
         return not is_new
     since = state.rejected_since
     for source in range(SOURCES):
-        since = max(since, state.aid_fused_stamp[Stream.GNSS_VELOCITY, source])
+        since = max(since, state.aid_fused_stamp[Stream.GNSS_VELOCITY.value, source])
     return state.rejected_fixes >= MEMBERS and state.stamp - since >= LAST_RESORT

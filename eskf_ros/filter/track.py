@@ -78,7 +78,7 @@ def is_fusing(state, stream, source):
 @njit
 def is_led(state, source):
     """Say whether velocities of a receiver come often enough to lead the track of its fixes."""
-    last = state.aid_stamp[Stream.GNSS_VELOCITY, source]
+    last = state.aid_stamp[Stream.GNSS_VELOCITY.value, source]
     return last != NEVER and state.stamp - last <= LONGEST_LEAD
 
 
@@ -97,7 +97,7 @@ def take_velocity(state, source, work):
     if not is_led(state, source):
         forget_rate(state, source)
         return
-    dt = (state.stamp - state.aid_stamp[Stream.GNSS_VELOCITY, source]) * 1e-9
+    dt = (state.stamp - state.aid_stamp[Stream.GNSS_VELOCITY.value, source]) * 1e-9
     for i in range(3):
         state.velocity_lead[source, i] += work.innovation[i] * dt
         state.velocity_lead_variance[source, i] += work.noise[i, i] * dt * dt
@@ -107,7 +107,7 @@ def take_velocity(state, source, work):
 def take_fix(state, source, work):
     """Let the track take a fix, if it belongs to it."""
     last = state.track_stamp[source]
-    if last == NEVER or state.stamp - last > patience(state, Stream.GNSS_POSITION, source):
+    if last == NEVER or state.stamp - last > patience(state, Stream.GNSS_POSITION.value, source):
         start_track(state, source, work)
         return
     nis = predict_track(state, source, work)
