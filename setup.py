@@ -61,9 +61,9 @@ setup(
     },
     entry_points={
         "console_scripts": [
-            "eskf_node = eskf_ros.node.main:main",
+            "eskf_node = eskf_ros.ros_node.main:main",
             "eskf_replay = eskf_ros.replay.main:main",
-            "eskf_ranges = eskf_ros.ranges.main:main",
+            "eskf_ranges = eskf_ros.inputs.ranges_command:main",
             "eskf_simulate = eskf_ros.simulate.main:main",
         ],
     },

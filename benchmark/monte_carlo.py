@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from eskf_ros.filter.layout import (
+from eskf_ros.filter.navigator import Navigator
+from eskf_ros.filter.state.layout import (
     ACCEL_BIAS,
     ATTITUDE,
     ERROR_SIZE,
@@ -31,7 +32,6 @@ from eskf_ros.filter.layout import (
     Stream,
     Verdict,
 )
-from eskf_ros.filter.navigator import Navigator
 from eskf_ros.parameters import Parameters, from_mapping
 from eskf_ros.simulate.imu import ImuMount
 from eskf_ros.simulate.scenario import Recording, simulate

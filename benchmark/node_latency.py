@@ -63,7 +63,7 @@ def measure(rate: float, seconds: float, is_late: bool) -> dict[str, float]:
             processes.callback(process.stop)
             return process
 
-        node = start("-m", "eskf_ros.node.main", "--ros-args", "--params-file", CONFIG)
+        node = start("-m", "eskf_ros.ros_node.main", "--ros-args", "--params-file", CONFIG)
         receiver = start(ENDS, "receive", received)
         sender = start(ENDS, "send", sent, node.popen.pid, rate, seconds, int(is_late))
         sender.popen.wait()

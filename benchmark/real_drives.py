@@ -27,8 +27,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from eskf_ros import earth, parameters
+from eskf_ros import parameters
 from eskf_ros.bags import open_bag
+from eskf_ros.geodesy import earth
 from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.gnss.ranges import ionosphere_free, one_per_satellite
 from eskf_ros.gnss.signals import Gnss

@@ -17,8 +17,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from eskf_ros import earth
 from eskf_ros.bags import open_bag
+from eskf_ros.geodesy import earth
 from eskf_ros.parameters import load
 from eskf_ros.replay.run import Options, replay
 

@@ -36,9 +36,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.filter.layout import CONSTRAINTS, ODOMETRY, RECORD, STREAM_NAMES, Status, Stream, Verdict
+from eskf_ros.filter.history.timeline import EARLY_AIDS, JUMP_CONFIRMATIONS, LARGEST_JUMP
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.filter.timeline import EARLY_AIDS, JUMP_CONFIRMATIONS, LARGEST_JUMP
+from eskf_ros.filter.state.layout import CONSTRAINTS, ODOMETRY, RECORD, STREAM_NAMES, Status, Stream, Verdict
 from eskf_ros.geodesy.map_frame import MapFrame, to_geodetic
 from eskf_ros.parameters import Parameters, from_mapping, load
 from eskf_ros.replay.summary import CHI_SQUARE_95, counted, final_result, named

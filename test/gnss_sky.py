@@ -9,7 +9,7 @@ import gnss_texts as texts
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic, geodetic_to_ecef
+from eskf_ros.geodesy.earth import east_north_up_to_ecef, ecef_to_geodetic, geodetic_to_ecef
 from eskf_ros.gnss.ephemeris import EPHEMERIS, Ephemerides, Message, glonass_record, kepler_record
 from eskf_ros.gnss.geometry import elevation_azimuth, line_of_sight, state_at_reception
 from eskf_ros.gnss.range_model import PREDICTION, predict

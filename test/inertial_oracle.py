@@ -1,7 +1,7 @@
 """Truth for the strapdown: an independent integration in the inertial frame, with scipy.
 
-Nothing of the estimator is used but the normal gravity of `eskf_ros.earth`. The state is integrated where Newton's law
-holds without Coriolis or transport terms: in axes that coincide with ECEF at time zero and do not rotate.
+Nothing of the estimator is used but the normal gravity of `eskf_ros.geodesy.earth`. The state is integrated where
+Newton's law holds without Coriolis or transport terms: in axes that coincide with ECEF at time zero and do not rotate.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from eskf_ros import earth
+from eskf_ros.geodesy import earth
 
 Array = NDArray[np.float64]
 Inputs = Callable[[float], tuple[Array, Array]]

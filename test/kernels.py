@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter import layout, strapdown
-from eskf_ros.filter.layout import NEVER
-from eskf_ros.filter.local_frame import set_datum
-from eskf_ros.filter.navigator import take_sample
+from eskf_ros.filter import predict
+from eskf_ros.filter.inertial.navigation_frame import set_datum
+from eskf_ros.filter.loop import take_sample
 from eskf_ros.filter.settings import settings_from
+from eskf_ros.filter.state import layout
+from eskf_ros.filter.state.time import NEVER
 from eskf_ros.parameters import from_mapping
 
 Array = NDArray[np.float64]
@@ -166,7 +167,7 @@ def _run_samples(state, samples, cuts, settings, work):
         sample = samples[k]
         while cut < len(cuts) and cuts[cut] < sample.stamp:
             if cuts[cut] > state.stamp:
-                strapdown.propagate(state, cuts[cut], sample, settings, work)
+                predict.propagate(state, cuts[cut], sample, settings, work)
             cut += 1
-        strapdown.propagate(state, sample.stamp, sample, settings, work)
+        predict.propagate(state, sample.stamp, sample, settings, work)
         take_sample(state, sample)

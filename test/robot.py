@@ -111,4 +111,4 @@ class Robot:
 
 
 def start_node(ros: Ros, *arguments: str) -> Process:
-    return ros.spawn([sys.executable, "-m", "eskf_ros.node.main", "--ros-args", *arguments])
+    return ros.spawn([sys.executable, "-m", "eskf_ros.ros_node.main", "--ros-args", *arguments])

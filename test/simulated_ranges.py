@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from eskf_ros.compiled import njit
-from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.geodesy.earth import east_north_up_to_ecef, ecef_to_geodetic
 from eskf_ros.gnss.atmosphere import ionosphere_scale, klobuchar, troposphere
 from eskf_ros.gnss.geometry import elevation_azimuth, line_of_sight, state_at_reception
 from eskf_ros.gnss.measurements import MEASURED_SIGNAL

@@ -11,9 +11,9 @@ from aided import offers
 from kernels import copy_of
 from monte_carlo import body_velocity_messages, wheel_messages
 
-from eskf_ros.filter.layout import CONSTRAINTS, Stream, Verdict
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.magnetic_model import FieldUnknown, field_at
+from eskf_ros.filter.state.layout import CONSTRAINTS, Stream, Verdict
+from eskf_ros.geodesy.magnetic_model import FieldUnknown, field_at
 from eskf_ros.parameters import from_mapping
 from eskf_ros.simulate.barometer import Barometer
 from eskf_ros.simulate.body_velocity import BodyVelocity

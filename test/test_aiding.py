@@ -12,8 +12,8 @@ import pytest
 from kernels import copy_of, make_settings, make_work, random_covariance, random_state, to_rotation, with_error
 from numpy.typing import NDArray
 
-from eskf_ros.earth import EARTH_RATE
-from eskf_ros.filter.aiding import gnss_position, gnss_velocity
+from eskf_ros.filter.measurements import gnss_position, gnss_velocity
+from eskf_ros.geodesy.earth import EARTH_RATE
 
 Array = NDArray[np.float64]
 

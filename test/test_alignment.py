@@ -22,10 +22,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from eskf_ros.filter import alignment, heading_start, level, local_frame, still_window
-from eskf_ros.filter.aiding import gnss_position
-from eskf_ros.filter.layout import AID, NEVER, allocate, blank_state
-from eskf_ros.filter.strapdown import gravity_map
+from eskf_ros.filter.alignment import first_fix, levelling
+from eskf_ros.filter.alignment import heading as heading_start
+from eskf_ros.filter.inertial import navigation_frame
+from eskf_ros.filter.inertial.strapdown import gravity_map
+from eskf_ros.filter.loop import update_rest
+from eskf_ros.filter.measurements import gnss_position
+from eskf_ros.filter.state.layout import AID, allocate, blank_state
+from eskf_ros.filter.state.time import NEVER
 
 Array = NDArray[np.float64]
 
@@ -53,7 +57,7 @@ def fresh(datum: tuple[float, float, float] | None = DATUM) -> Any:
     """Return a filter that has seen nothing but, perhaps, its datum."""
     state = blank_state()[0]
     if datum is not None:
-        local_frame.set_datum(state, math.radians(datum[0]), math.radians(datum[1]), datum[2])
+        navigation_frame.set_datum(state, math.radians(datum[0]), math.radians(datum[1]), datum[2])
     return state
 
 
@@ -65,7 +69,7 @@ def at_rest(state: Any, attitude: Rotation, accel_bias: Any, gyro_bias: Any) -> 
 
 
 def level_with(state: Any, force: Array, rate: Array, settings: Any, still: bool = True) -> None:
-    level.level(state, COUNT * np.concatenate([force, rate]), COUNT, 1.0 / RATE_HZ, still, settings)
+    levelling.level(state, COUNT * np.concatenate([force, rate]), COUNT, 1.0 / RATE_HZ, still, settings)
 
 
 def mean_noise(rng: np.random.Generator, settings: Any, sensor: str) -> Array:
@@ -78,7 +82,7 @@ def mean_noise(rng: np.random.Generator, settings: Any, sensor: str) -> Array:
 
 def tilt_error(state: Any, attitude: Rotation) -> Array:
     """Return the horizontal part of theta in R_true = exp(theta) R, whatever the heading of either."""
-    up = np.array(local_frame.local_up(state))
+    up = np.array(navigation_frame.local_up(state))
     true_up_body = attitude.inv().apply(up)
     return np.cross(to_rotation(state["attitude"]).apply(true_up_body), up)
 
@@ -100,7 +104,7 @@ def test_tilt_error_is_what_the_accelerometer_bias_makes_of_it(seed: int, still:
     bias = rng.normal(0.0, 0.05, 3)
     state = fresh()
     level_with(state, *at_rest(state, attitude, bias, np.zeros(3)), make_settings(**MOUNT), still)
-    up = np.array(local_frame.local_up(state))
+    up = np.array(navigation_frame.local_up(state))
     expected = np.cross(up, to_rotation(state["attitude"]).apply(bias)) / 9.81
     # To the second order in bias over gravity.
     np.testing.assert_allclose(tilt_error(state, attitude), expected, rtol=0.0, atol=3.0 * (0.1 / 9.8) ** 2)
@@ -123,7 +127,7 @@ def test_mounted_upside_down(axis: tuple[float, float, float], angle: float) -> 
 @pytest.mark.parametrize("a", [(0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (0.6, 0.8, 0.0), (0.0, -0.6, 0.8)])
 def test_turn_into_the_exact_opposite(a: tuple[float, float, float]) -> None:
     opposite = tuple(-c for c in a)
-    turn = local_frame.shortest_turn(a, opposite)
+    turn = navigation_frame.shortest_turn(a, opposite)
     assert np.linalg.norm(turn) == pytest.approx(math.pi, abs=1e-12)
     np.testing.assert_allclose(Rotation.from_rotvec(turn).apply(a), opposite, rtol=0.0, atol=1e-12)
 
@@ -179,7 +183,7 @@ def test_gyro_bias_is_the_bayesian_posterior(seed: int, case: str) -> None:
     duration = COUNT / RATE_HZ
     noise = settings["gyro_noise_density"] ** 2 / duration + settings["gyro_bias_random_walk"] ** 2 * duration / 3.0
     to_body = to_rotation(state["attitude"]).inv().as_matrix()
-    up = np.array(local_frame.local_up(state))
+    up = np.array(navigation_frame.local_up(state))
     earth = np.array(state["earth_rate_map"])
     across = np.eye(3) - np.outer(up, up)
     # A rate of known size and unknown direction has half of its square on each of two axes.
@@ -256,7 +260,7 @@ def test_set_heading_turns_the_tilt_error_with_the_attitude(seed: int) -> None:
     turn = to_rotation(state["attitude"]) * to_rotation(before["attitude"]).inv()
     # What is true has not moved: its tilt, seen from the new attitude, has.
     np.testing.assert_allclose(tilt_error(state, truth), turn.apply(theta), rtol=0.0, atol=5e-6)
-    up = np.array(local_frame.local_up(before))
+    up = np.array(navigation_frame.local_up(before))
     full = np.eye(15)
     full[6:9, 6:9] = (np.eye(3) - np.outer(up, up)) @ turn.as_matrix()
     expected = full @ core(before) @ full.T
@@ -384,7 +388,7 @@ def watch(state: Any, settings: Any, seconds: float, force: Any, rate: Any, shak
         state["stamp"] += 10_000_000
         state["specific_force"] = np.array(force) + (shaking * math.sin(0.9 * k), 0.0, 0.0)
         state["angular_rate"] = rate
-        still_window.update_static_window(state, settings)
+        update_rest(state, settings)
 
 
 def waiting() -> Any:
@@ -454,7 +458,7 @@ def test_restart_while_standing_still_counts_from_zero() -> None:
     force, rate = at_rest(state, Rotation.identity(), np.zeros(3), bias)
     watch(state, settings, 20.5, force, rate)
     np.testing.assert_allclose(state["gyro_bias"], bias, rtol=0.0, atol=1e-4)
-    alignment.restart(state)
+    first_fix.restart(state)
     state["stamp"] += 6_000_000_000
     watch(state, settings, 2.5, force, rate)
     assert state["level_known"] == 1
@@ -470,7 +474,7 @@ def test_restart_under_way_does_not_know_the_heading_of_the_start() -> None:
     watch(state, settings, 2.5, force, rate)
     assert state["heading_known"] == 1
     state["attitude"] = to_quaternion(Rotation.from_euler("z", 170.0, degrees=True))
-    alignment.restart(state)
+    first_fix.restart(state)
     state["stamp"] += 6_000_000_000
     watch(state, settings, 2.5, force, rate)
     assert state["heading_known"] == 0 or core(state)[8, 8] > 0.5
@@ -495,7 +499,8 @@ def distrusting(robots: int, std: float, speed: float = 0.0) -> int:
             longitude = math.radians(DATUM[1]) + east / (6.378e6 * math.cos(latitude))
             aid["stamp"] = round(seconds * 1e9)
             aid["payload"][:9] = (latitude, longitude, DATUM[2] + up, std**2, 0.0, 0.0, std**2, 0.0, std**2)
-            still_window.update_evidence_from_fix(state, aid, settings)
+            if static_window.update_evidence_from_fix(state, aid):
+                levelling.reset_level_to_moving(state, settings)
             if state["motion_stamp"] > 0 and state["still_stamp"] == NEVER:
                 found += 1
                 break
@@ -525,7 +530,7 @@ def test_first_fix_starts_the_position() -> None:
     attitude = Rotation.from_euler("xyz", [0.3, -0.2, 0.0])
     level_with(state, *at_rest(state, attitude, np.zeros(3), np.zeros(3)), settings)
     payload = np.array([math.radians(48.0), math.radians(11.0), 500.0, 1.0, 0.0, 0.0, 1.0, 0.0, 4.0])
-    alignment.reset_position_to_fix(state, payload)
+    first_fix.reset_position_to_fix(state, payload)
     assert (state["datum_known"], state["position_known"]) == (1, 1)
     np.testing.assert_array_equal(state["datum"], payload[:3])
     np.testing.assert_allclose(state["position_map"], 0.0, atol=1e-9)
@@ -533,7 +538,7 @@ def test_first_fix_starts_the_position() -> None:
     assert np.linalg.norm(tilt_error(state, attitude)) < 1e-6
     assert (core(state) == core(state).T).all()
     assert conditioned_eigenvalues(core(state)).min() > 0.0
-    np.testing.assert_array_equal(np.diag(core(state))[:3], alignment.START_POSITION_STD**2)
+    np.testing.assert_array_equal(np.diag(core(state))[:3], first_fix.START_POSITION_STD**2)
 
 
 def test_far_datum_levels_along_the_local_vertical() -> None:
@@ -545,8 +550,8 @@ def test_far_datum_levels_along_the_local_vertical() -> None:
     force = attitude.inv().apply([0.0, 0.0, 9.81])
     level_with(state, force, np.zeros(3), settings)
     payload = np.array([math.radians(52.5), math.radians(11.0), 80.0, 1.0, 0.0, 0.0, 1.0, 0.0, 4.0])
-    alignment.reset_position_to_fix(state, payload)
-    up = np.array(local_frame.local_up(state))
+    first_fix.reset_position_to_fix(state, payload)
+    up = np.array(navigation_frame.local_up(state))
     assert math.degrees(math.acos(up[2])) == pytest.approx(4.5, abs=0.02)
     measured_up = to_rotation(state["attitude"]).apply(force / 9.81)
     np.testing.assert_allclose(measured_up, up, rtol=0.0, atol=1e-6)

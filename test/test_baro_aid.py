@@ -13,9 +13,9 @@ from kernels import Array, make_settings, make_work, random_state, with_error
 from monte_carlo import Run, feed
 from test_aiding import geodetic_of
 
-from eskf_ros.filter import optional
-from eskf_ros.filter.aiding import baro
-from eskf_ros.filter.layout import ERROR_SIZE, Stream, Verdict
+from eskf_ros.filter.measurements import baro
+from eskf_ros.filter.state import augmented_states
+from eskf_ros.filter.state.layout import ERROR_SIZE, Stream, Verdict
 from eskf_ros.simulate.barometer import Barometer, standard_pressure
 from eskf_ros.simulate.recording import Recording
 from eskf_ros.simulate.scenario import simulate
@@ -35,7 +35,7 @@ def running(seed: int, far: float) -> Any:
     state = random_state(seed, far)
     x, y, _ = state["position_map"]
     state["position_map"][2] = -(x**2 + y**2) / (2.0 * 6.37e6) + 50.0
-    optional.join(state, SETTINGS["reach"][Stream.BARO], SETTINGS)
+    augmented_states.join(state, SETTINGS["reach"][Stream.BARO], SETTINGS)
     rng = np.random.default_rng(seed)
     state["optional"][OFFSET - ERROR_SIZE] = rng.normal(0.0, 100.0)
     state["optional"][SCALE - ERROR_SIZE] = rng.normal(0.0, 0.05)

@@ -17,10 +17,12 @@ import numpy as np
 import pytest
 from kernels import core
 
-from eskf_ros.filter import fusion, layout, navigator, settings, strapdown, update
-from eskf_ros.filter.layout import ACCEL_BIAS, GYRO_BIAS
+from eskf_ros.filter import fuse, navigator, predict, settings
+from eskf_ros.filter.measurements import kalman_update
+from eskf_ros.filter.state import layout
+from eskf_ros.filter.state.layout import ACCEL_BIAS, GYRO_BIAS
+from eskf_ros.geodesy.rotation import to_matrix
 from eskf_ros.parameters import from_mapping
-from eskf_ros.rotation import to_matrix
 from eskf_ros.simulate.scenario import SCENARIOS, Recording, simulate
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "benchmark"))
@@ -177,10 +179,10 @@ class FrozenGain:
                 self.next_fix < len(recording.fix_stamp) and recording.fix_stamp[self.next_fix] < self.sample["stamp"]
             ):
                 fix_stamp = int(recording.fix_stamp[self.next_fix])
-                strapdown.propagate(self.state, fix_stamp, self.sample, self.settings, self.work)
+                predict.propagate(self.state, fix_stamp, self.sample, self.settings, self.work)
                 self.correct(self.next_fix)
                 self.next_fix += 1
-            strapdown.propagate(self.state, recording.imu_stamp[i], self.sample, self.settings, self.work)
+            predict.propagate(self.state, recording.imu_stamp[i], self.sample, self.settings, self.work)
             navigator.take_sample(self.state, self.sample)
             self.next_imu += 1
 
@@ -199,7 +201,7 @@ class FrozenGain:
             aid = layout.allocate(layout.AID)[0]
             aid["stream"] = stream
             aid["payload"][:9] = np.concatenate([values, covariance[six]])
-            fusion.linearize(self.state, aid, self.settings, self.work)
+            fuse.linearize(self.state, aid, self.settings, self.work)
             body_to_map = np.array(to_matrix(tuple(self.state["attitude"])))
             if stream not in self.gains:
                 self.gains[stream] = self.optimal_gain(body_to_map)
@@ -207,7 +209,7 @@ class FrozenGain:
             for block in (ACCEL_BIAS, GYRO_BIAS):
                 correction[block : block + 3] = body_to_map.T @ correction[block : block + 3]
             self.work["correction"][:15] = correction
-            update.inject(self.state, self.work["correction"])
+            kalman_update.inject(self.state, self.work["correction"])
 
     def optimal_gain(self, body_to_map: np.ndarray) -> np.ndarray:
         """The Kalman gain of what was just linearised, (15, 3), the rows of the biases in map axes."""

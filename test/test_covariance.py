@@ -25,9 +25,10 @@ from kernels import (
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from eskf_ros.earth import SEMI_MAJOR_AXIS
-from eskf_ros.filter import covariance as kernel
-from eskf_ros.filter.strapdown import gravity_map, step
+from eskf_ros.filter.inertial import covariance as kernel
+from eskf_ros.filter.inertial.strapdown import gravity_map
+from eskf_ros.filter.predict import step
+from eskf_ros.geodesy.earth import SEMI_MAJOR_AXIS
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import pymap3d
 import pytest
 from numpy.typing import NDArray
 
-from eskf_ros import earth
+from eskf_ros.geodesy import earth
 
 Array = NDArray[np.float64]
 ELLIPSOID = pymap3d.Ellipsoid.from_name("wgs84")

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
+from eskf_ros.geodesy.earth import east_north_up_to_ecef, ecef_to_geodetic
 from eskf_ros.gnss.ephemeris import Ephemerides
 from eskf_ros.gnss.measurements import (
     DEFAULT_MASKS,

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
-from eskf_ros.earth import EARTH_RATE, east_north_up_to_ecef
+from eskf_ros.geodesy.earth import EARTH_RATE, east_north_up_to_ecef
 from eskf_ros.gnss import geometry, orbits
 from eskf_ros.gnss.ephemeris import NO_ISSUE, Ephemerides, Message, glonass_record, kepler_record
 from eskf_ros.gnss.ranges import choose

@@ -21,8 +21,8 @@ from eskf_ros.gnss.range_files import read_navigation_files, read_range_file
 from eskf_ros.gnss.ranges import Status
 from eskf_ros.gnss.rinex import RinexError
 from eskf_ros.gnss.signals import SPEED_OF_LIGHT, Gnss
-from eskf_ros.ranges.beside import EPHEMERIDES_PER_MESSAGE, RangesError, merged, read_beside
-from eskf_ros.ranges.main import main
+from eskf_ros.inputs.ranges_command import main
+from eskf_ros.inputs.rinex_as_messages import EPHEMERIDES_PER_MESSAGE, RangesError, merged, read_beside
 from eskf_ros.simulate import constellation
 from eskf_ros.simulate.main import main as simulate_main
 from eskf_ros.simulate.range_receiver import RangeMeasurements, RangeReceiver

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from simulated import TOPICS, assert_chi_square, seconds
 
 from eskf_ros.bags import POINT_CLOUD, open_bag
-from eskf_ros.earth import ecef_to_geodetic
+from eskf_ros.geodesy.earth import ecef_to_geodetic
 from eskf_ros.geodesy.map_frame import east_north_up_to_ecef
 from eskf_ros.gnss import time as gnss_time
 from eskf_ros.gnss.cloud import read_epoch

@@ -14,10 +14,11 @@ from kernels import copy_of, make_settings, make_work, random_covariance, random
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from eskf_ros.filter import optional
-from eskf_ros.filter.aiding import nhc, wheel
-from eskf_ros.filter.layout import ERROR_SIZE, NEVER, NOWHERE, Stream, Verdict
+from eskf_ros.filter.measurements import nhc, wheel
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.filter.state import augmented_states
+from eskf_ros.filter.state.layout import ERROR_SIZE, NOWHERE, Stream, Verdict
+from eskf_ros.filter.state.time import NEVER
 from eskf_ros.parameters import from_mapping
 from eskf_ros.simulate.episodes import WheelSlip
 from eskf_ros.simulate.scenario import Recording, simulate
@@ -46,7 +47,7 @@ def moving(seed: int, settings: Any = SETTINGS) -> Any:
     """Return a running filter at a grid point, in motion, with whatever optional states the wheels need."""
     state = random_state(seed)
     rng = np.random.default_rng(seed)
-    optional.join(state, settings["reach"][Stream.WHEEL], settings)
+    augmented_states.join(state, settings["reach"][Stream.WHEEL], settings)
     if state["error_size"] > ERROR_SIZE:
         state["optional"][:3] = rng.normal(0.0, (0.1, 0.1, 0.05))
     state["block_end"] = state["stamp"]

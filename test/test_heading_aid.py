@@ -15,11 +15,11 @@ from scipy.stats import chi2
 from test_aiding import geodetic_of, local_axes_in_map
 
 from eskf_ros.bags import Batch, message_dtype
-from eskf_ros.filter import optional
-from eskf_ros.filter.aiding import heading
-from eskf_ros.filter.layout import ERROR_SIZE, Status, Stream, Verdict
+from eskf_ros.filter.measurements import heading
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.inputs import INPUTS
+from eskf_ros.filter.state import augmented_states
+from eskf_ros.filter.state.layout import ERROR_SIZE, Status, Stream, Verdict
+from eskf_ros.inputs.table import INPUTS
 from eskf_ros.simulate.dual_antenna import DualAntenna
 from eskf_ros.simulate.recording import Recording
 from eskf_ros.simulate.scenario import simulate
@@ -97,7 +97,7 @@ def test_the_innovation_is_the_short_way_round(turns: float, off: float) -> None
 def test_the_offset_is_in_yaw_alone() -> None:
     state, plain, work = levelled(1, 0.0), make_work(), make_work()
     heading.linearize(state, payload(0.3, 0.1, (1e-4, 4e-4)), 0, SETTINGS, plain)
-    optional.join(state, SETTINGS["reach"][Stream.HEADING], SETTINGS)
+    augmented_states.join(state, SETTINGS["reach"][Stream.HEADING], SETTINGS)
     place = int(SETTINGS["heading_offset_at"])
     state["optional"][place - ERROR_SIZE] = 0.02
     heading.linearize(state, payload(0.3, 0.1, (1e-4, 4e-4)), 0, SETTINGS, work)

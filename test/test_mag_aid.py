@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from test_aiding import geodetic_of, local_axes_in_map
 
-from eskf_ros import magnetic_model
-from eskf_ros.filter import optional
-from eskf_ros.filter.aiding import mag
-from eskf_ros.filter.layout import ERROR_SIZE, Status, Stream, Verdict
-from eskf_ros.magnetic_model import FieldUnknown, field_at
+from eskf_ros.filter.measurements import mag
+from eskf_ros.filter.state import augmented_states
+from eskf_ros.filter.state.layout import ERROR_SIZE, Status, Stream, Verdict
+from eskf_ros.geodesy import magnetic_model
+from eskf_ros.geodesy.magnetic_model import FieldUnknown, field_at
 from eskf_ros.simulate.dual_antenna import DualAntenna
 from eskf_ros.simulate.episodes import MagneticDisturbance
 from eskf_ros.simulate.magnetometer import Magnetometer
@@ -53,7 +53,7 @@ needs_model = pytest.mark.skipif(not installed(), reason="pygeomag is not instal
 def in_the_field(seed: int, far: float, with_model: bool = True) -> tuple[Any, Array]:
     """Return a running filter in a magnetic field and the payload of an error-free reading, by way of pymap3d."""
     state = random_state(seed, far)
-    optional.join(state, SETTINGS["reach"][Stream.MAG], SETTINGS)
+    augmented_states.join(state, SETTINGS["reach"][Stream.MAG], SETTINGS)
     rng = np.random.default_rng(seed)
     state["optional"][ERROR - ERROR_SIZE] = rng.normal(0.0, 0.05)
     state["optional"][IRON - ERROR_SIZE : IRON - ERROR_SIZE + 3] = rng.normal(0.0, 3e-6, 3)

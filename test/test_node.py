@@ -189,7 +189,7 @@ def test_what_cannot_be_used_is_named_in_one_line_and_ends_the_node(ros, argumen
 def test_the_node_imports_no_recording_or_plotting_library():
     """On a robot only numpy, scipy, numba and ROS are installed."""
     code = (
-        "import sys, eskf_ros.node.node;"
+        "import sys, eskf_ros.ros_node.node;"
         "bad = {'rosbags', 'mcap', 'matplotlib', 'rich', 'zstandard', 'lz4', 'ruamel'} & set(sys.modules);"
         "sys.exit(', '.join(sorted(bad)) or 0)"
     )

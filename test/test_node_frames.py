@@ -13,11 +13,11 @@ from kernels import to_quaternion, to_rotation
 from ros_process import needs_ros
 from scipy.spatial.transform import Rotation
 
-from eskf_ros.filter.layout import ODOMETRY
-from eskf_ros.node.extrinsics import ANTENNA, IMU, Extrinsics, matrix_of, roll_pitch_yaw_deg
-from eskf_ros.node.planar import PLANAR, flatten
-from eskf_ros.node.transforms import Track, TransformWatch, map_to_odom, yaw_of
+from eskf_ros.filter.state.layout import ODOMETRY
 from eskf_ros.parameters import Parameters, from_mapping
+from eskf_ros.ros_node.extrinsics import ANTENNA, IMU, Extrinsics, matrix_of, roll_pitch_yaw_deg
+from eskf_ros.ros_node.transforms import Track, TransformWatch, map_to_odom, yaw_of
+from eskf_ros.ros_node.two_d import PLANAR, flatten
 
 angles = st.tuples(st.floats(-math.pi, math.pi), st.floats(-1.5, 1.5), st.floats(-math.pi, math.pi))
 positions = st.tuples(*[st.floats(-1e4, 1e4)] * 3)

@@ -9,15 +9,15 @@ import pytest
 from ros_process import needs_ros
 
 from eskf_ros.bags import Batch, StringTable, decode, encode, message_dtype
-from eskf_ros.filter.layout import Stream, Verdict
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.settings import intakes_from
+from eskf_ros.filter.state.layout import Stream, Verdict
 from eskf_ros.gnss.cloud import fields_of, write_epoch
 from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, SATELLITE_KNOWN, allocate_ranges
 from eskf_ros.gnss.ranges import Status as RangeStatus
-from eskf_ros.inputs import FIXES, INPUTS, RANGES
+from eskf_ros.inputs.epochs import RangeIntake
+from eskf_ros.inputs.table import FIXES, INPUTS, RANGES
 from eskf_ros.parameters import Leaf, ParameterError, Parameters, from_mapping, leaves
-from eskf_ros.ranges.intake import RangeIntake
 
 SECOND = 1_000_000_000
 STAMP = 1_700_000_000_123_456_789
@@ -71,7 +71,7 @@ def test_node_and_replay_give_the_estimator_the_same_numbers(kind: Any, type_nam
     """A message that the message library has serialised, of every input in every type; and it has what was sent."""
     from rclpy.serialization import deserialize_message, serialize_message
 
-    from eskf_ros.node.inputs import AidInput, message_class
+    from eskf_ros.ros_node.subscriptions import AidInput, message_class
 
     choice = {f"topics.{kind.name}_type": type_name} if kind.others else {}
     source = AidInput(kind, from_mapping(choice), "topic")
@@ -91,7 +91,7 @@ def test_node_and_replay_give_the_estimator_the_same_numbers(kind: Any, type_nam
 @needs_ros
 @pytest.mark.parametrize(("kind", "type_name"), EVERY_TYPE, ids=names)
 def test_what_is_no_message_is_refused_and_other_encodings_are_read(kind: Any, type_name: str) -> None:
-    from eskf_ros.node.inputs import AidInput
+    from eskf_ros.ros_node.subscriptions import AidInput
 
     choice = {f"topics.{kind.name}_type": type_name} if kind.others else {}
     source = AidInput(kind, from_mapping(choice), "topic")
@@ -111,7 +111,7 @@ def test_clouds_reach_the_navigator_as_in_the_replay() -> None:
     from rclpy.serialization import serialize_message
     from sensor_msgs.msg import PointCloud2, PointField
 
-    from eskf_ros.node.inputs import open_inputs
+    from eskf_ros.ros_node.subscriptions import open_inputs
 
     ranges = allocate_ranges(4)
     ranges["sv_id"], ranges["signal"] = np.arange(1, 5), 0
@@ -153,7 +153,7 @@ def test_a_velocity_without_covariance_takes_the_stand_in() -> None:
 
 @needs_ros
 def test_each_receiver_has_its_own_offset_and_its_own_clock() -> None:
-    from eskf_ros.node.inputs import open_inputs
+    from eskf_ros.ros_node.subscriptions import open_inputs
 
     given = {
         "gnss.time_offset": -0.1,
@@ -176,7 +176,7 @@ def test_each_receiver_has_its_own_offset_and_its_own_clock() -> None:
 @needs_ros
 @pytest.mark.parametrize("change", [{"mode": "tight"}, {"ranges.use_point_solution": True}])
 def test_beside_ranges_the_node_listens_to_the_fixes_of_a_second_receiver_only(change: dict[str, Any]) -> None:
-    from eskf_ros.node.inputs import open_inputs
+    from eskf_ros.ros_node.subscriptions import open_inputs
 
     def heard(given: dict[str, Any]) -> set[str]:
         return {source.kind.name for source in open_inputs(from_mapping(given), str)} & {*RANGES, *FIXES}
@@ -190,7 +190,7 @@ def test_beside_ranges_the_node_listens_to_the_fixes_of_a_second_receiver_only(c
 def test_a_type_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     import sys
 
-    from eskf_ros.node.inputs import open_inputs
+    from eskf_ros.ros_node.subscriptions import open_inputs
 
     monkeypatch.setitem(sys.modules, "nav_msgs.msg", None)
     with pytest.raises(ParameterError, match=r"topics\.wheel_type.*nav_msgs/msg/Odometry is not installed"):

@@ -13,11 +13,11 @@ from robot import CONFIG, read_drive
 from ros_process import free_domain, needs_ros
 
 from eskf_ros.bags import StringTable, decode, encode
-from eskf_ros.filter.layout import Status, Stream
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.filter.state.layout import Status, Stream
 from eskf_ros.geodesy.map_frame import MapFrame
-from eskf_ros.node.trouble import FRESH, KINDS, Trouble
 from eskf_ros.parameters import load
+from eskf_ros.ros_node.error_counter import FRESH, KINDS, Trouble
 
 SECOND = 1_000_000_000
 FIX, TWIST, IMU = "sensor_msgs/msg/NavSatFix", "geometry_msgs/msg/TwistWithCovarianceStamped", "sensor_msgs/msg/Imu"
@@ -33,7 +33,7 @@ class Inside:
     def __init__(self, *arguments: str) -> None:
         from rclpy.context import Context
 
-        from eskf_ros.node.node import EskfNode
+        from eskf_ros.ros_node.node import EskfNode
 
         self.context = Context()
         words = ["--params-file", str(CONFIG), "--log-level", "fatal", *arguments]
@@ -493,7 +493,7 @@ class Services:
     """What a node of robot_localization's clients would see."""
 
     def __init__(self, navigator: Navigator, monkeypatch: pytest.MonkeyPatch) -> None:
-        from eskf_ros.node import robot_localization
+        from eskf_ros.ros_node import robot_localization
 
         kinds = SimpleNamespace(FromLL="FromLL", ToLL="ToLL", SetDatum="SetDatum", SetPose="SetPose")
         monkeypatch.setattr(robot_localization, "services", kinds)

@@ -17,10 +17,10 @@ from robot import CONFIG, Robot, read_drive, stamp_of, start_node
 from ros_process import Ros, needs_ros
 from scipy.spatial.transform import Rotation
 
-from eskf_ros.filter.warm_start import Memory
+from eskf_ros.filter.alignment.warm_start import Memory
 from eskf_ros.geodesy.map_frame import MapFrame
-from eskf_ros.node.memory import read_memory, write_memory
 from eskf_ros.parameters import load
+from eskf_ros.ros_node.memory import read_memory, write_memory
 from eskf_ros.simulate.scenario import simulate
 
 pytestmark = needs_ros
@@ -126,7 +126,7 @@ def test_a_node_restarts_into_running_traffic(ros):
 STALLED = """
 import sys, time
 from std_msgs.msg import Empty
-from eskf_ros.node import main, node
+from eskf_ros.ros_node import main, node
 
 class Stalled(node.EskfNode):
     def __init__(self):

@@ -24,12 +24,12 @@ from ros_process import Ros, free_domain, needs_ros
 
 import eskf_ros
 from eskf_ros.compiled import COMPILED, _sources_digest, sentence_on_compiling
-from eskf_ros.filter.layout import ODOMETRY, allocate
-from eskf_ros.node.cdr import ImuReader, LayoutError, OdometryMessageWriter, OdometryWriter, imu_from_message
-from eskf_ros.node.clocks import Stamp, StampMonitor, clock_complaints
-from eskf_ros.node.odometry import fill_odometry
-from eskf_ros.node.planar import PLANAR_VARIANCE
+from eskf_ros.filter.state.layout import ODOMETRY, allocate
 from eskf_ros.parameters import ParameterError, Parameters, leaves, to_mapping, to_yaml
+from eskf_ros.ros_node.cdr import ImuReader, LayoutError, OdometryMessageWriter, OdometryWriter, imu_from_message
+from eskf_ros.ros_node.clocks import Stamp, StampMonitor, clock_complaints
+from eskf_ros.ros_node.odometry import fill_odometry
+from eskf_ros.ros_node.two_d import PLANAR_VARIANCE
 
 SECOND = 1_000_000_000
 FRAMES = [*("x" * length for length in range(1, 18)), "", "imu_link", "robot_1/imu", "größe", "x" * 255]
@@ -300,7 +300,7 @@ def make_node() -> Iterator[Callable[..., Any]]:
 
 
 def test_every_parameter_is_declared_with_its_default_and_explained(make_node: Callable[..., Any]) -> None:
-    from eskf_ros.node.declare import declare
+    from eskf_ros.ros_node.declare import declare
 
     node = make_node()
     parameters = declare(node)
@@ -319,7 +319,7 @@ def test_every_parameter_is_declared_with_its_default_and_explained(make_node: C
 
 
 def test_parameter_file_with_all_defaults_is_accepted(make_node: Callable[..., Any], tmp_path: Path) -> None:
-    from eskf_ros.node.declare import declare, unused_overrides
+    from eskf_ros.ros_node.declare import declare, unused_overrides
 
     file = tmp_path / "eskf.yaml"
     file.write_text(to_yaml(), encoding="utf-8")
@@ -330,7 +330,7 @@ def test_parameter_file_with_all_defaults_is_accepted(make_node: Callable[..., A
 
 def test_values_from_file_and_command_line(make_node: Callable[..., Any], tmp_path: Path) -> None:
     """Integers are fine for numbers, an empty datum means none, and the command line wins."""
-    from eskf_ros.node.declare import declare
+    from eskf_ros.ros_node.declare import declare
 
     file = tmp_path / "mine.yaml"
     file.write_text(
@@ -360,7 +360,7 @@ def test_values_from_file_and_command_line(make_node: Callable[..., Any], tmp_pa
 
 
 def test_unknown_and_impossible_overrides_are_all_named(make_node: Callable[..., Any]) -> None:
-    from eskf_ros.node.declare import declare
+    from eskf_ros.ros_node.declare import declare
 
     node = make_node(
         *("-p", "gnss.gate_probabillity:=0.9"),
@@ -388,7 +388,7 @@ def test_overrides_that_nothing_used_are_found(make_node: Callable[..., Any]) ->
     from rclpy.qos_overriding_options import QoSOverridingOptions
     from std_msgs.msg import Empty
 
-    from eskf_ros.node.declare import declare, unused_overrides
+    from eskf_ros.ros_node.declare import declare, unused_overrides
 
     node = make_node(
         *("-p", "qos_overrides./used.subscription.depth:=7"), *("-p", "qos_overrides./typo.subscription.depth:=7")
@@ -407,7 +407,7 @@ def test_overrides_that_nothing_used_are_found(make_node: Callable[..., Any]) ->
 def test_live_parameters_change_and_the_others_do_not(make_node: Callable[..., Any]) -> None:
     from rclpy.parameter import Parameter
 
-    from eskf_ros.node.declare import LiveParameters, declare
+    from eskf_ros.ros_node.declare import LiveParameters, declare
 
     node = make_node()
     told: list[Parameters] = []
@@ -596,7 +596,7 @@ def test_a_recording_without_its_clock_is_guessed() -> None:
 
 NODE = """
 import sys
-from eskf_ros.node.life import StopFlag, run
+from eskf_ros.ros_node.process import StopFlag, run
 stop = StopFlag()
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
@@ -604,7 +604,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Imu
 import numpy as np
 import eskf_ros
-from eskf_ros.node.cdr import ImuReader, OdometryWriter
+from eskf_ros.ros_node.cdr import ImuReader, OdometryWriter
 
 class Echo(Node):
     def __init__(self):
@@ -723,7 +723,7 @@ def test_either_executor_serves_the_node(
     """Installations of Jazzy before 7.1.4 have no events executor; the loop is the same."""
     from rclpy.executors import SingleThreadedExecutor
 
-    from eskf_ros.node.life import StopFlag, make_executor, spin
+    from eskf_ros.ros_node.process import StopFlag, make_executor, spin
 
     if not events_executor:
         monkeypatch.setitem(sys.modules, "rclpy.experimental.events_executor", None)
@@ -797,10 +797,10 @@ def test_parameters_change_over_the_network(ros: Ros, tmp_path: Path) -> None:
     script = tmp_path / "live.py"
     script.write_text(
         textwrap.dedent("""
-            from eskf_ros.node.life import StopFlag, run
+            from eskf_ros.ros_node.process import StopFlag, run
             stop = StopFlag()
             from rclpy.node import Node
-            from eskf_ros.node.declare import LiveParameters, declare
+            from eskf_ros.ros_node.declare import LiveParameters, declare
 
             class Live(Node):
                 def __init__(self):
@@ -865,9 +865,9 @@ def test_compiling_is_told_and_loading_from_the_cache_is_not(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("file", "is_compiled_anew"),
     [
-        ("filter/update.py", True),  # has kernels
-        ("filter/layout.py", True),  # has none, but kernels take its constants
-        ("node/planar.py", True),
+        ("filter/measurements/kalman_update.py", True),  # has kernels
+        ("filter/state/layout.py", True),  # has none, but kernels take its constants
+        ("ros_node/two_d.py", True),
         ("replay/main.py", False),
         ("api.py", False),
     ],
@@ -895,9 +895,10 @@ def test_compiling_says_so_at_once_and_then_seldom() -> None:
 @pytest.mark.skipif(not COMPILED, reason="the kernels run uncompiled here")
 def test_the_command_compiles_without_ros_and_says_where() -> None:
     code = (
-        "import sys; sys.modules['rclpy'] = None; from eskf_ros.node.main import main; status = main(['--compile']); "
+        "import sys; sys.modules['rclpy'] = None; from eskf_ros.ros_node.main import main; "
+        "status = main(['--compile']); "
         "from eskf_ros.compiled import CACHE_FOLDER; from eskf_ros.filter import navigator; "
-        "from eskf_ros.gnss import measurements; from eskf_ros.node import odometry; "
+        "from eskf_ros.gnss import measurements; from eskf_ros.ros_node import odometry; "
         "print(len(navigator.advance.signatures), len(measurements.measure.signatures), "
         "len(odometry.fill_odometry.signatures)); print(CACHE_FOLDER); sys.exit(status)"
     )
@@ -909,7 +910,7 @@ def test_the_command_compiles_without_ros_and_says_where() -> None:
 
 
 def test_without_numba_there_is_nothing_to_compile() -> None:
-    code = "import sys; from eskf_ros.node.main import main; sys.exit(main(['--compile']))"
+    code = "import sys; from eskf_ros.ros_node.main import main; sys.exit(main(['--compile']))"
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
     ended = subprocess.run([sys.executable, "-c", code], env=environment, check=False, capture_output=True, text=True)
     assert ended.returncode == 2
@@ -919,7 +920,7 @@ def test_without_numba_there_is_nothing_to_compile() -> None:
 def test_catching_signals_costs_no_import_of_ros() -> None:
     """They must be caught before the second that importing rclpy takes."""
     code = (
-        "import sys; from eskf_ros.node.life import StopFlag; StopFlag(); "
+        "import sys; from eskf_ros.ros_node.process import StopFlag; StopFlag(); "
         "sys.exit(any(name in sys.modules for name in ('rclpy', 'numpy', 'numba')))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

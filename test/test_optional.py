@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from kernels import USUAL_STDS, copy_of, core, make_settings, make_state, make_work, random_covariance, random_state
 from numpy.typing import NDArray
 
-from eskf_ros.filter import optional
-from eskf_ros.filter.aiding import gnss_position
-from eskf_ros.filter.layout import AID, ERROR_SIZE, NOWHERE, Stream, Verdict, allocate
+from eskf_ros.filter.integrity.recovery import reset_for_new_solution
+from eskf_ros.filter.measurements import gnss_position
+from eskf_ros.filter.measurements.kalman_update import update
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.filter.recovery import reset_for_new_solution
-from eskf_ros.filter.strapdown import step
-from eskf_ros.filter.update import update
+from eskf_ros.filter.predict import step
+from eskf_ros.filter.state import augmented_states
+from eskf_ros.filter.state.layout import AID, ERROR_SIZE, NOWHERE, Stream, Verdict, allocate
 from eskf_ros.parameters import from_mapping
 from eskf_ros.simulate.scenario import Recording, simulate
 
@@ -41,7 +41,7 @@ STDS = np.concatenate([USUAL_STDS, [1.0, 1.0, 1.0]])
 def joined(seed: int) -> Any:
     """Return a running filter with the lasting position error in use, all of it correlated."""
     state = random_state(seed)
-    optional.join(state, LASTING["reach"][Stream.GNSS_POSITION], LASTING)
+    augmented_states.join(state, LASTING["reach"][Stream.GNSS_POSITION], LASTING)
     state["covariance"][:SIZE, :SIZE] = random_covariance(seed, STDS)
     state["optional"][:3] = np.random.default_rng(seed).normal(size=3)
     return state
@@ -59,7 +59,7 @@ def test_joining_gives_the_first_variance_and_no_correlation() -> None:
     core(state)[:] = random_covariance(1, USUAL_STDS)
     state["covariance"][15:] = state["covariance"][:, 15:] = 7.0
     before = copy_of(state)
-    optional.join(state, SIZE, LASTING)
+    augmented_states.join(state, SIZE, LASTING)
     assert state["error_size"] == SIZE
     np.testing.assert_array_equal(core(state), core(before))
     np.testing.assert_array_equal(state["covariance"][15:SIZE, :SIZE], np.eye(3, SIZE, 15))
@@ -67,7 +67,7 @@ def test_joining_gives_the_first_variance_and_no_correlation() -> None:
     core(state)[0, 0] = 5.0
     state["covariance"][15, 0] = state["covariance"][0, 15] = 0.3
     again = copy_of(state)
-    optional.join(state, SIZE, LASTING)
+    augmented_states.join(state, SIZE, LASTING)
     assert state.tobytes() == again.tobytes()
 
 
@@ -112,11 +112,11 @@ def test_propagation_is_the_dense_product(seed: int, dt: float) -> None:
 
 def test_what_lasts_keeps_its_variance_and_forgets_in_its_time() -> None:
     state = make_state()
-    optional.join(state, SIZE, LASTING)
+    augmented_states.join(state, SIZE, LASTING)
     # How it starts shows in what it has in common with the position.
     state["covariance"][0, 15] = state["covariance"][15, 0] = 0.5
     for _ in range(round(TIME / 0.02)):
-        optional.propagate_augmented(state, 0.02, LASTING)
+        augmented_states.propagate_augmented(state, 0.02, LASTING)
     np.testing.assert_allclose(np.diag(state["covariance"])[15:18], 1.0, rtol=1e-3)
     assert state["covariance"][0, 15] == pytest.approx(0.5 * math.exp(-1.0), rel=1e-3)
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from eskf_ros.filter.layout import Stream, Verdict
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.filter.state.layout import Stream, Verdict
 from eskf_ros.gnss.cloud import write_epoch
 from eskf_ros.gnss.ephemeris import Broadcast, Message
 from eskf_ros.gnss.ephemeris_cloud import write_ephemerides
@@ -19,8 +19,8 @@ from eskf_ros.gnss.range_files import read_navigation_files
 from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, SATELLITE_KNOWN, allocate_ranges
 from eskf_ros.gnss.ranges import Status as RangeStatus
 from eskf_ros.gnss.signals import Gnss
+from eskf_ros.inputs.epochs import DEFAULT_KLOBUCHAR, RECENT, RangeIntake
 from eskf_ros.parameters import from_mapping
-from eskf_ros.ranges.intake import DEFAULT_KLOBUCHAR, RECENT, RangeIntake
 
 SECOND = 1_000_000_000
 STAMP = 1_700_000_000_123_456_789

@@ -10,12 +10,12 @@ import pytest
 from kernels import copy_of, make_settings, make_work, random_covariance, random_state, to_rotation, with_error
 from numpy.typing import NDArray
 
-from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
-from eskf_ros.filter import optional
-from eskf_ros.filter.aiding import pseudorange, range_rate
-from eskf_ros.filter.aiding import signal as signal_place
-from eskf_ros.filter.aiding.signal import FLAGS, MEASURED, SATELLITE, SATELLITE_VELOCITY, STD, source_of
-from eskf_ros.filter.layout import ERROR_SIZE, INTER_SYSTEM, NOWHERE, PAYLOAD_SIZE, Stream
+from eskf_ros.filter.state import augmented_states
+from eskf_ros.filter.state.layout import ERROR_SIZE, INTER_SYSTEM, NOWHERE, PAYLOAD_SIZE, Stream
+from eskf_ros.filter.tight import pseudorange, range_rate
+from eskf_ros.filter.tight import signal as signal_place
+from eskf_ros.filter.tight.signal import FLAGS, MEASURED, SATELLITE, SATELLITE_VELOCITY, STD, source_of
+from eskf_ros.geodesy.earth import east_north_up_to_ecef, ecef_to_geodetic
 from eskf_ros.gnss.measurements import MEASURED_SIGNAL, predict_measured
 from eskf_ros.gnss.range_model import NO_KLOBUCHAR, PREDICTION
 from eskf_ros.gnss.ranges import ALREADY_TURNED, IONOSPHERE_APPLIED, TROPOSPHERE_APPLIED
@@ -55,7 +55,7 @@ arms = pytest.mark.parametrize("settings", [SETTINGS, LONG_ARM], ids=["short", "
 def tight_state(seed: int, far: float = 3000.0) -> Any:
     """Return a running filter in which the clock and all offsets are in use."""
     state = random_state(seed, far)
-    optional.join(state, SIZE, SETTINGS)
+    augmented_states.join(state, SIZE, SETTINGS)
     rng = np.random.default_rng(seed)
     state["optional"][CLOCK - ERROR_SIZE : SIZE - ERROR_SIZE] = rng.normal(0.0, 30.0, SIZE - CLOCK)
     return state
@@ -229,7 +229,7 @@ def test_each_constellation_has_an_offset_of_its_own_and_gps_none() -> None:
 def test_what_lasts_moves_the_antenna_that_the_satellites_see(seed: int) -> None:
     """By its standard deviations times the state; its columns are those of the position times those."""
     state, work, plain = random_state(seed), make_work(), make_work()
-    optional.join(state, LASTING["reach"][Stream.PSEUDORANGE], LASTING)
+    augmented_states.join(state, LASTING["reach"][Stream.PSEUDORANGE], LASTING)
     place = int(LASTING["position_error_at"])
     payload = signal_payload(state, seed)
     pseudorange.linearize(state, payload, GPS, LASTING, plain)
@@ -265,13 +265,13 @@ def test_clock_between_epochs(steps: int) -> None:
     )
     state = random_state(5)
     size = CLOCK + 2
-    optional.join(state, size, settings)
+    augmented_states.join(state, size, settings)
     stds = np.concatenate([np.repeat([2.0, 0.3, 0.02, 0.1, 0.003], 3), np.full(CLOCK - ERROR_SIZE, 1.0), [20.0, 0.5]])
     state["covariance"][:size, :size] = random_covariance(5, stds)
     state["optional"][CLOCK - ERROR_SIZE : size - ERROR_SIZE] = 100.0, -7.0
     before = copy_of(state)
     for _ in range(steps):
-        optional.propagate_augmented(state, time / steps, settings)
+        augmented_states.propagate_augmented(state, time / steps, settings)
     transition = np.eye(size)
     transition[CLOCK, CLOCK + 1] = time
     expected = transition @ before["covariance"][:size, :size] @ transition.T

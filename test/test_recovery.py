@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from eskf_ros.filter.layout import Phase, Status, Stream, Verdict
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.filter.state.layout import Phase, Status, Stream, Verdict
 from eskf_ros.parameters import from_mapping
 from eskf_ros.simulate.episodes import Episode, Outage
 from eskf_ros.simulate.gnss_episodes import Multipath, Spoofing

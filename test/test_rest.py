@@ -12,9 +12,9 @@ from kernels import copy_of, make_settings, make_work, random_state, with_error
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from eskf_ros.filter.aiding import body_velocity, zaru, zupt
-from eskf_ros.filter.layout import CONSTRAINT_INTERVAL, GYRO_BIAS, Stream, Verdict
+from eskf_ros.filter.measurements import body_velocity, zaru, zupt
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.filter.state.layout import CONSTRAINT_INTERVAL, GYRO_BIAS, Stream, Verdict
 from eskf_ros.parameters import from_mapping
 from eskf_ros.simulate.body_velocity import BodyVelocity
 from eskf_ros.simulate.episodes import Outage

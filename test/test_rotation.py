@@ -12,7 +12,7 @@ from kernels import to_quaternion, to_rotation, tuples
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from eskf_ros import rotation
+from eskf_ros.geodesy import rotation
 
 Array = NDArray[np.float64]
 

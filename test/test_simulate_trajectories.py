@@ -15,12 +15,12 @@ from simulated import FRAME, assert_chi_square, assert_imu_integrates_back, atti
 from eskf_ros.simulate import aeroplane, boat, multirotor, walk
 from eskf_ros.simulate.aeroplane import AeroplaneTrajectory
 from eskf_ros.simulate.imu import ImuMount, ideal_samples
+from eskf_ros.simulate.jets import Taylor, arctan2, moving_body, sin_cos, sqrt
 from eskf_ros.simulate.motion import Motion
 from eskf_ros.simulate.multirotor import Land, Leg, MultirotorTrajectory, TakeOff
 from eskf_ros.simulate.path import PathState
 from eskf_ros.simulate.profile import ClimbTo, Hold, SpeedTo, Turn, TurnInPlace
 from eskf_ros.simulate.scenario import SCENARIOS, simulate, trajectory
-from eskf_ros.simulate.taylor import Taylor, arctan2, moving_body, sin_cos, sqrt
 from eskf_ros.simulate.trajectory import DriveTrajectory
 from eskf_ros.simulate.walk import WalkTrajectory
 from eskf_ros.simulate.wheel import WheelOdometer

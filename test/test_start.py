@@ -12,8 +12,9 @@ from kernels import make_settings
 from monte_carlo import Run, feed, nees
 from scipy.stats import chi2
 
-from eskf_ros.filter import sway
-from eskf_ros.filter.layout import NEVER, Status, blank_state
+from eskf_ros.filter.state.layout import Status, blank_state
+from eskf_ros.filter.state.time import NEVER
+from eskf_ros.filter.stationarity import residual_motion
 from eskf_ros.simulate.recording import Recording
 from eskf_ros.simulate.scenario import simulate
 
@@ -36,7 +37,7 @@ def window_of(rates: Any) -> Any:
     for k, rate in enumerate(rates):
         state["stamp"] += 10_000_000
         state["angular_rate"] = rate
-        sway.add_to_part(state)
+        residual_motion.add_to_part(state)
         # What the watch for stillness does between the first and the last sample of a window.
         state["window_start"] = 1
         assert k < 199 or state["parts"] == PARTS - 1
@@ -52,7 +53,7 @@ def test_noise_and_vibration_are_no_sway(vibration: float) -> None:
     found = 0
     for _ in range(300):
         noise = density * math.sqrt(RATE) * rng.normal(size=(200, 3))
-        found += sway.sway_variance(window_of(noise + shaking), 3, density) > 0.0
+        found += residual_motion.sway_variance(window_of(noise + shaking), 3, density) > 0.0
     assert found <= 2
 
 
@@ -61,7 +62,7 @@ def test_waves_are_sway_of_their_size() -> None:
     times = np.arange(200) / RATE
     for phase in np.arange(8) * math.pi / 4.0:
         rate = 0.1 * np.sin(2.0 * math.pi * 0.2 * times + phase)
-        found = math.sqrt(sway.sway_variance(window_of(np.outer(rate, [0.0, 1.0, 0.0])), 3, density))
+        found = math.sqrt(residual_motion.sway_variance(window_of(np.outer(rate, [0.0, 1.0, 0.0])), 3, density))
         assert found == pytest.approx(np.std(rate), rel=0.3)
 
 
@@ -69,7 +70,7 @@ def test_a_new_window_begins_new_parts() -> None:
     state = window_of(np.ones((200, 3)))
     state["window_start"] = NEVER
     state["angular_rate"] = 0.0
-    sway.add_to_part(state)
+    residual_motion.add_to_part(state)
     assert state["parts"] == 0
     assert (state["part_sum"] == 0.0).all()
 

@@ -12,10 +12,11 @@ from kernels import copy_of, core, make_settings, make_state, make_work, random_
 from monte_carlo import BLOCKS, nees
 from numpy.typing import NDArray
 
-from eskf_ros.filter.layout import AID, CONSTRAINT_INTERVAL, NEVER, RECORD, Stream, Verdict, allocate
+from eskf_ros.filter.measurements.kalman_update import update
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.filter.stillness import learn_from_block, update_rest_evidence
-from eskf_ros.filter.update import update
+from eskf_ros.filter.state.layout import AID, CONSTRAINT_INTERVAL, RECORD, Stream, Verdict, allocate
+from eskf_ros.filter.state.time import NEVER
+from eskf_ros.filter.stationarity.detector import learn_from_block, update_rest_evidence
 from eskf_ros.parameters import from_mapping
 from eskf_ros.simulate.imu import vibration
 from eskf_ros.simulate.scenario import SCENARIOS, Recording, simulate

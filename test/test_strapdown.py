@@ -15,7 +15,9 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from eskf_ros.filter.strapdown import LONGEST_STEP, SECOND, gravity_map, step
+from eskf_ros.filter.inertial.strapdown import gravity_map
+from eskf_ros.filter.predict import LONGEST_STEP, step
+from eskf_ros.filter.state.time import SECOND
 from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.simulate.imu import ideal_samples
 from eskf_ros.simulate.scenario import DATUM, trajectory

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eskf_ros.filter.layout import Status, Verdict
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.filter.state.layout import Status, Verdict
 from eskf_ros.parameters import from_mapping
 from eskf_ros.simulate.scenario import Recording, simulate
 

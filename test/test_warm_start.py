@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from eskf_ros.filter.layout import RECORD, Status, Verdict
+from eskf_ros.filter.alignment.warm_start import Memory
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.filter.warm_start import Memory
-from eskf_ros.node.memory import read_memory, write_memory
+from eskf_ros.filter.state.layout import RECORD, Status, Verdict
 from eskf_ros.parameters import from_mapping
+from eskf_ros.ros_node.memory import read_memory, write_memory
 from eskf_ros.simulate.scenario import Recording, simulate
 
 HOUR = 3600.0
@@ -172,7 +172,7 @@ def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path, parked, monkeypat
     def fail(descriptor: int) -> None:
         raise OSError("the disk is full")
 
-    monkeypatch.setattr("eskf_ros.node.memory.os.fsync", fail)
+    monkeypatch.setattr("eskf_ros.ros_node.memory.os.fsync", fail)
     with pytest.raises(OSError, match="full"):
         write_memory(path, dataclasses.replace(true_memory(parked), altitude=1.0))
     assert path.read_bytes() == before

@@ -10,21 +10,36 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from eskf_ros.compiled import njit
-from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
-from eskf_ros.filter.aid_monitors import aid_complaints
-from eskf_ros.filter.aiding import heading, mag
-from eskf_ros.filter.alignment import place, restart
-from eskf_ros.filter.door import ABSENT, admit
-from eskf_ros.filter.fusion import fuse
-from eskf_ros.filter.heading_start import heading_of
-from eskf_ros.filter.layout import (
+from eskf_ros.filter.alignment.first_fix import place
+from eskf_ros.filter.alignment.heading_search import forget_search
+from eskf_ros.filter.alignment.warm_start import Memory, recall
+from eskf_ros.filter.history.admission import ABSENT, admit
+from eskf_ros.filter.history.timeline import (
+    CHECKPOINT_SPACING,
+    EARLY_AIDS,
+    doubled,
+    forget,
+    insert_imu,
+    offer_aid,
+    raise_barrier,
+    take_final,
+)
+from eskf_ros.filter.inertial.navigation_frame import heading_of, move_datum, set_datum
+from eskf_ros.filter.integrity.fix_tracker import forget_tracks
+from eskf_ros.filter.integrity.monitors import complaints, is_heading_contradicted
+from eskf_ros.filter.integrity.receiver_monitor import aid_complaints
+from eskf_ros.filter.integrity.recovery import phase_of
+from eskf_ros.filter.loop import advance
+from eskf_ros.filter.measurements import heading, mag
+from eskf_ros.filter.output.global_odometry import status_of, write_odometry
+from eskf_ros.filter.output.local_odometry import note_jump
+from eskf_ros.filter.settings import UNKNOWN_ANGLE_VARIANCE, intakes_from, settings_from
+from eskf_ros.filter.state.layout import (
     AID,
     ERROR_SIZE,
     IMU,
     INTER_SYSTEM,
     LOCAL,
-    NEVER,
     ODOMETRY,
     RECORD,
     STATE,
@@ -37,46 +52,21 @@ from eskf_ros.filter.layout import (
     allocate,
     blank_state,
 )
-from eskf_ros.filter.level import update_level_in_motion
-from eskf_ros.filter.local import carry, measure_step, note_jump
-from eskf_ros.filter.local_frame import move_datum, set_datum
-from eskf_ros.filter.monitors import complaints, is_heading_contradicted
-from eskf_ros.filter.output import status_of, write_odometry
-from eskf_ros.filter.ranges import end_of_epoch, fuse_ranges, is_range, offer_signals
-from eskf_ros.filter.recovery import phase_of
-from eskf_ros.filter.settings import UNKNOWN_ANGLE_VARIANCE, intakes_from, settings_from
-from eskf_ros.filter.still_window import update_static_window
-from eskf_ros.filter.stillness import add_to_block
-from eskf_ros.filter.strapdown import SECOND, propagate
-from eskf_ros.filter.sway import add_to_part
-from eskf_ros.filter.timeline import (
-    CHECKPOINT_SPACING,
-    EARLY_AIDS,
-    doubled,
-    forget,
-    insert_imu,
-    offer_aid,
-    raise_barrier,
-    rewind,
-    save_checkpoint,
-    take_final,
-)
-from eskf_ros.filter.warm_start import Memory, recall
+from eskf_ros.filter.state.time import NEVER, SECOND
+from eskf_ros.filter.tight.epoch import offer_signals
+from eskf_ros.geodesy.earth import east_north_up_to_ecef, ecef_to_geodetic
+from eskf_ros.geodesy.magnetic_model import FieldUnknown, field_at
+from eskf_ros.geodesy.rotation import to_matrix
 from eskf_ros.gnss.measurements import MEASURED_SIGNAL
 from eskf_ros.gnss.range_model import NO_KLOBUCHAR
 from eskf_ros.gnss.ranges import Status as RangeStatus
 from eskf_ros.gnss.ranges import status_counts
 from eskf_ros.gnss.time import SECONDS_PER_WEEK, Instant
-from eskf_ros.magnetic_model import FieldUnknown, field_at
 from eskf_ros.parameters import Parameters
-from eskf_ros.rotation import to_matrix
 
 FloatArray = npt.NDArray[np.float64]
 StampArray = npt.NDArray[np.int64]
 
-
-LONGEST_GAP = 5 * SECOND
-"""The IMU was silent for longer (ns): nothing is left of attitude and velocity, start again."""
 
 IMU_BATCH = 1024
 
@@ -102,95 +92,6 @@ NO_FIELD = (0.0, 0.0, 0.0, 0.0)
 
 NO_STAND_IN = (0.0, 0.0, 0.0)
 """The covariance of a message is its own."""
-
-
-@njit
-def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, locals_, rows):
-    """Run the filter over all that waits, in the total order; return how many rows were written.
-
-    One row for every IMU sample that is new and first on the output grid.
-    """
-    t, settings, work, local = timeline[0], settings_[0], work_[0], locals_[0]
-    rewind(states, checkpoints, t, blank)
-    state = states[0]
-    row_count = 0
-    while state.imu_next < t.imu_count:
-        sample = imu[state.imu_next]
-
-        while state.aid_next < t.aid_count and aids[state.aid_next].stamp < sample.stamp:
-            predict(state, aids[state.aid_next].stamp, sample, settings, work)
-            state.aid_next = fuse_next(state, aids, t.aid_count, settings, work)
-
-        previous_stamp = state.imu_stamp
-        predict(state, sample.stamp, sample, settings, work)
-        take_sample(state, sample)
-        measure_step(state, settings)
-        add_to_part(state)
-        update_static_window(state, settings)
-        update_level_in_motion(state, settings)
-        add_to_block(state, settings)
-        save_checkpoint(states, checkpoints, t)
-
-        is_new = sample.stamp > t.published and state.level_known == 1
-        if is_new:
-            carry(local, state, settings)
-
-        while state.aid_next < t.aid_count and aids[state.aid_next].stamp == sample.stamp:
-            state.aid_next = fuse_next(state, aids, t.aid_count, settings, work)
-
-        if is_new and is_on_grid(previous_stamp, sample.stamp, settings.output_interval):
-            write_odometry(state, local, settings, rows[row_count])
-            row_count += 1
-        t.published = max(t.published, sample.stamp)
-    return row_count
-
-
-@njit
-def predict(state, stamp, sample, settings, work):
-    """Bring the state to ``stamp``, at or before the IMU sample that comes next."""
-    if state.level_known == 0:
-        return
-    if sample.stamp - state.imu_stamp > LONGEST_GAP:
-        position = (state.position_map[0], state.position_map[1], state.position_map[2])
-        restart(state)
-        note_jump(state, position, heading_of(state, settings), settings)
-        return
-    propagate(state, stamp, sample, settings, work)
-
-
-@njit
-def take_sample(state, sample):
-    """Make an IMU sample the newest reading of the state."""
-    if state.imu_stamp != NEVER:
-        state.imu_interval = (sample.stamp - state.imu_stamp) * 1e-9
-    state.imu_stamp = sample.stamp
-    state.stamp = sample.stamp
-    state.imu_next += 1
-    for i in range(3):
-        state.earlier_force[i] = state.imu_force[i]
-        state.earlier_rate[i] = state.imu_rate[i]
-        state.imu_force[i] = sample.specific_force[i]
-        state.imu_rate[i] = sample.angular_rate[i]
-        state.specific_force[i] = sample.specific_force[i]
-        state.angular_rate[i] = sample.angular_rate[i]
-
-
-@njit
-def fuse_next(state, aids, count, settings, work):
-    """Offer the next of ``count`` measurements, signals by the epoch; return the index of the one that follows."""
-    i = state.aid_next
-    if not is_range(aids[i].stream):
-        fuse(state, aids, i, settings, work)
-        return i + 1
-    end = end_of_epoch(aids, i, count)
-    fuse_ranges(state, aids, i, end, settings, work)
-    return end
-
-
-@njit
-def is_on_grid(previous_stamp, stamp, interval):
-    """Say whether a multiple of ``interval`` (0: everything) lies in (previous_stamp, stamp]."""
-    return interval == 0 or previous_stamp == NEVER or stamp // interval != previous_stamp // interval
 
 
 class Navigator:
@@ -280,6 +181,8 @@ class Navigator:
         datum = math.radians(latitude_deg), math.radians(longitude_deg), float(altitude)
         if state["position_known"]:
             move_datum(state, *datum, settings)
+            forget_search(state)
+            forget_tracks(state)
             note_jump(state, position, heading, settings)
         else:
             set_datum(state, *datum)
@@ -299,6 +202,7 @@ class Navigator:
         before, heading_before = tuple(state["position_map"]), heading_of(state, settings)
         covariance = np.ascontiguousarray(position_covariance, np.float64)
         place(state, tuple(float(v) for v in position_map), covariance, float(heading), float(heading_std), settings)
+        forget_tracks(state)
         note_jump(state, before, heading_before, settings)
         self._raise_barrier()
         return True

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtri
 
-from eskf_ros.filter.layout import (
+from eskf_ros.filter.state.layout import (
     CONSTRAINTS,
     ERROR_SIZE,
     INTER_SYSTEM,
@@ -20,10 +20,10 @@ from eskf_ros.filter.layout import (
     Stream,
     allocate,
 )
-from eskf_ros.filter.strapdown import SECOND
+from eskf_ros.filter.state.time import SECOND
+from eskf_ros.geodesy.rotation import from_roll_pitch_yaw, to_matrix
 from eskf_ros.gnss.signals import Gnss
 from eskf_ros.parameters import Aid, Parameters
-from eskf_ros.rotation import from_roll_pitch_yaw, to_matrix
 
 Axes = tuple[float, float, float]
 FloatArray = npt.NDArray[np.float64]

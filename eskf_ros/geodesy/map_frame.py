@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros import earth
 from eskf_ros.compiled import njit
+from eskf_ros.geodesy import earth
 
 Array = NDArray[np.float64]
 

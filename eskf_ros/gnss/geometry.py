@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 
 from eskf_ros.compiled import njit
-from eskf_ros.earth import EARTH_RATE
+from eskf_ros.geodesy.earth import EARTH_RATE
+from eskf_ros.geodesy.rotation import rotate_back
 from eskf_ros.gnss.orbits import satellite_state
 from eskf_ros.gnss.signals import SPEED_OF_LIGHT
-from eskf_ros.rotation import rotate_back
 
 
 @njit

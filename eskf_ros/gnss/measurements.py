@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.compiled import njit
-from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
+from eskf_ros.geodesy.earth import east_north_up_to_ecef, ecef_to_geodetic
 from eskf_ros.gnss.ephemeris import Ephemerides
 from eskf_ros.gnss.geometry import distance, turned, turned_at_arrival
 from eskf_ros.gnss.range_model import NO_KLOBUCHAR, PREDICTION, sight

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.earth import SEMI_MAJOR_AXIS, east_north_up_to_ecef, ecef_to_geodetic
+from eskf_ros.geodesy.earth import SEMI_MAJOR_AXIS, east_north_up_to_ecef, ecef_to_geodetic
 from eskf_ros.gnss.range_model import NO_KLOBUCHAR, PREDICTION, predict
 from eskf_ros.gnss.ranges import CODE_VALID, DEFAULT_CN0_MASK, DOPPLER_VALID, Status
 from eskf_ros.gnss.signals import GNSS_COUNT, Gnss, time_group

@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
-from eskf_ros.earth import east_north_up_to_ecef, ecef_to_geodetic
+from eskf_ros.geodesy.earth import east_north_up_to_ecef, ecef_to_geodetic
 from eskf_ros.gnss.atmosphere import ionosphere_scale, klobuchar, troposphere
 from eskf_ros.gnss.geometry import elevation_azimuth, line_of_sight
 from eskf_ros.gnss.ranges import ALREADY_TURNED, IONOSPHERE_APPLIED, TROPOSPHERE_APPLIED

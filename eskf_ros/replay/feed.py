@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.bags import Batch
-from eskf_ros.filter.layout import ODOMETRY, Status
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.inputs import Input
-from eskf_ros.ranges.intake import RangeIntake
+from eskf_ros.filter.state.layout import ODOMETRY, Status
+from eskf_ros.inputs.epochs import RangeIntake
+from eskf_ros.inputs.table import Input
 from eskf_ros.replay.topics import TopicNames
 
 LARGEST_PUSH = 1024

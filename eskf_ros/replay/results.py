@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.bags import BagWriter, message_dtype
-from eskf_ros.filter.aiding.signal import name_of
-from eskf_ros.filter.layout import STREAM_NAMES, Stream, Verdict
+from eskf_ros.filter.state.layout import STREAM_NAMES, Stream, Verdict
+from eskf_ros.filter.tight.signal import name_of
 from eskf_ros.geodesy.map_frame import MapFrame, to_geodetic
 from eskf_ros.parameters import Frames
-from eskf_ros.replay.digits import tum_text
 from eskf_ros.replay.topics import FIX, ODOMETRY
+from eskf_ros.replay.tum_writer import tum_text
 
 NAMES = ("odometry.mcap", "trajectory.tum", "aids.csv", "summary.json")
 AIDS_HEADER = "stamp,arrival,aid,innovation_0,innovation_1,innovation_2,nis,dof,verdict,source\n"

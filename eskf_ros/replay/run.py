@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.bags import BagReader, Batch, open_bag
-from eskf_ros.filter.layout import ODOMETRY
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.filter.state.layout import ODOMETRY
 from eskf_ros.gnss.rinex import RinexError
-from eskf_ros.inputs import FIX
+from eskf_ros.inputs.epochs import RangeIntake
+from eskf_ros.inputs.rinex_as_messages import RangesError, merged, read_beside
+from eskf_ros.inputs.table import FIX
 from eskf_ros.parameters import Parameters
-from eskf_ros.ranges.beside import RangesError, merged, read_beside
-from eskf_ros.ranges.intake import RangeIntake
 from eskf_ros.replay.feed import Feed
 from eskf_ros.replay.results import ResultFiles, selected
 from eskf_ros.replay.summary import Summary, ranges_result, truth_result

@@ -28,12 +28,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.filter.layout import STREAM_NAMES, Status, Stream, Verdict
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.filter.state.layout import STREAM_NAMES, Status, Stream, Verdict
 from eskf_ros.geodesy.map_frame import MapFrame, east_north_up_to_ecef, to_geodetic
-from eskf_ros.inputs import Input
+from eskf_ros.inputs.epochs import RangeIntake
+from eskf_ros.inputs.table import Input
 from eskf_ros.parameters import Parameters
-from eskf_ros.ranges.intake import RangeIntake
 from eskf_ros.replay.feed import Feed
 from eskf_ros.replay.topics import TopicNames
 from eskf_ros.replay.truth import rotation_matrices

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.bags import BagReader, Batch
-from eskf_ros.filter.layout import Stream
+from eskf_ros.filter.state.layout import Stream
 from eskf_ros.geodesy.map_frame import MapFrame
-from eskf_ros.inputs import FIX, ODOMETRY, RANGES, TWIST, Input, inputs_of, uses_ranges
+from eskf_ros.inputs.table import FIX, ODOMETRY, RANGES, TWIST, Input, inputs_of, uses_ranges
 from eskf_ros.parameters import Parameters, Topics
 from eskf_ros.replay.truth import epochs_from_fix, epochs_from_odometry
 

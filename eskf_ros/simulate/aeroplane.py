@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from eskf_ros.earth import STANDARD_GRAVITY
+from eskf_ros.geodesy.earth import STANDARD_GRAVITY
+from eskf_ros.simulate.jets import Taylor, arctan2, sin_cos
 from eskf_ros.simulate.path import PathState, PathTrajectory, Pose
-from eskf_ros.simulate.taylor import Taylor, arctan2, sin_cos
 
 WIND = (4.0, 3.0)
 """Velocity of the air, east and north, m/s."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from eskf_ros.simulate.jets import Taylor, sin_cos
 from eskf_ros.simulate.path import PathState, PathTrajectory, Pose, waves
-from eskf_ros.simulate.taylor import Taylor, sin_cos
 
 CURRENT = (0.35, -0.25)
 """Velocity of the water, east and north, m/s."""

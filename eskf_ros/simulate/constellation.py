@@ -15,7 +15,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from eskf_ros.earth import SEMI_MAJOR_AXIS
+from eskf_ros.geodesy.earth import SEMI_MAJOR_AXIS
 from eskf_ros.gnss.ephemeris import Broadcast, Message
 from eskf_ros.gnss.orbits import GRAVITY, J2_GLONASS, RATE
 from eskf_ros.gnss.rinex_nav_writer import navigation_text, rounded

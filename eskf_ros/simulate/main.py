@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from eskf_ros.bags import BagError, BagWriter
-from eskf_ros.simulate import spelled
+from eskf_ros.simulate import option_text
 from eskf_ros.simulate.frames import STRINGS
 from eskf_ros.simulate.imu import GRADES
 from eskf_ros.simulate.messages import Topic, topics_of
@@ -100,10 +100,10 @@ def _options(arguments: argparse.Namespace) -> dict[str, Any]:
         "imu_rate": arguments.imu_rate,
         "gnss_rate": arguments.gnss_rate,
         "truth_rate": arguments.truth_rate,
-        "episodes": tuple(spelled.read(text, EPISODES)[1] for text in arguments.episode),
+        "episodes": tuple(option_text.read(text, EPISODES)[1] for text in arguments.episode),
     }
-    options.update(spelled.read(text, AIDS) for text in arguments.sensor)
-    options.update(spelled.read_value(text, Options) for text in arguments.set)
+    options.update(option_text.read(text, AIDS) for text in arguments.sensor)
+    options.update(option_text.read_value(text, Options) for text in arguments.set)
     return options
 
 
@@ -113,11 +113,11 @@ def _list() -> str:
         "Scenarios:",
         *(f"  {name:{width}}  {found.description}" for name, found in SCENARIOS.items()),
         "Sensors, with --sensor:",
-        *(f"  {spelled.spelled(name, kind)}" for name, kind in AIDS.items()),
+        *(f"  {option_text.spelled(name, kind)}" for name, kind in AIDS.items()),
         "Episodes, with --episode; START and LENGTH in seconds:",
-        *(f"  {spelled.spelled(name, kind)}" for name, kind in EPISODES.items()),
+        *(f"  {option_text.spelled(name, kind)}" for name, kind in EPISODES.items()),
         "All options, with --set:",
-        *(f"  {text}" for text in spelled.values(Options)),
+        *(f"  {text}" for text in option_text.values(Options)),
     ]
     return "\n".join(lines)
 

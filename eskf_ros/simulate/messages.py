@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros import rotation
 from eskf_ros.bags import POINT_CLOUD, message_dtype
+from eskf_ros.geodesy import rotation
 from eskf_ros.simulate import aid_messages
 from eskf_ros.simulate.frames import Frame
 from eskf_ros.simulate.gnss import GnssMeasurements

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from eskf_ros import rotation
+from eskf_ros.geodesy import rotation
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PPoly
 
-from eskf_ros.earth import STANDARD_GRAVITY
+from eskf_ros.geodesy.earth import STANDARD_GRAVITY
+from eskf_ros.simulate.jets import Taylor, arctan2, moving_body, sin_cos, sqrt
 from eskf_ros.simulate.motion import Motion, Vector, checked_times
 from eskf_ros.simulate.path import waves
-from eskf_ros.simulate.taylor import Taylor, arctan2, moving_body, sin_cos, sqrt
 
 Array = NDArray[np.float64]
 

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PPoly
 
+from eskf_ros.simulate.jets import Taylor, moving_body, sin
 from eskf_ros.simulate.motion import Motion, checked_times
 from eskf_ros.simulate.profile import FlightInstruction, Profile, stacked
 from eskf_ros.simulate.quadrature import PositionIntegral
-from eskf_ros.simulate.taylor import Taylor, moving_body, sin
 
 Array = NDArray[np.float64]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from eskf_ros.simulate.jets import Taylor, sin, sin_cos
 from eskf_ros.simulate.path import PathState, PathTrajectory, Pose, waves
-from eskf_ros.simulate.taylor import Taylor, sin, sin_cos
 
 STRIDE = 1.4
 """Metres of a stride, which is two steps."""

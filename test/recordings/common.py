@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from eskf_ros import earth
 from eskf_ros.bags import BagWriter, message_dtype
+from eskf_ros.geodesy import earth
 from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.replay.main import main
 

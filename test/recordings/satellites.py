@@ -16,7 +16,7 @@ from eskf_ros.gnss.ephemeris_cloud import write_ephemerides
 from eskf_ros.gnss.point_solution import PointSolution, SolutionStatus, solve
 from eskf_ros.gnss.ranges import SATELLITE_KNOWN, locate, one_per_satellite
 from eskf_ros.gnss.signals import Gnss
-from eskf_ros.ranges.intake import DEFAULT_KLOBUCHAR
+from eskf_ros.inputs.epochs import DEFAULT_KLOBUCHAR
 from recordings.common import GNSS_FRAME, STATUS_FIX, Array, Fixes, Messages, ecef_to_geodetic_deg, nanoseconds
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.earth import east_north_up_to_ecef, geodetic_to_ecef
+from eskf_ros.geodesy.earth import east_north_up_to_ecef, geodetic_to_ecef
 from eskf_ros.gnss.ephemeris import Ephemerides
 from eskf_ros.gnss.point_solution import PointSolution, SolutionStatus, solve
 from eskf_ros.gnss.ranges import locate

@@ -25,7 +25,7 @@ import numpy as np
 from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 
-from eskf_ros import earth
+from eskf_ros.geodesy import earth
 from eskf_ros.geodesy.map_frame import east_north_up_to_ecef
 from recordings.common import (
     STATUS_FIX,

@@ -1,0 +1,46 @@
+"""Heading from wheels: which way the vehicle moves on the map while its wheels say that it rolls forward.
+
+The slow robot with fixes of a metre accelerates too little for the search to see it. What its wheels measure is a
+velocity in axes that are level and turned by the unknown angle: one more measurement that is linear in cosine and sine.
+"""
+
+from __future__ import annotations
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.alignment.heading import search_with
+from eskf_ros.filter.inertial.navigation_frame import body_rate
+from eskf_ros.filter.measurements.jacobians import vehicle_axes
+from eskf_ros.filter.measurements.wheel import repeated
+from eskf_ros.geodesy.rotation import cross, rotate, to_matrix
+
+LEAST_SPEED = 0.7
+"""Slower wheels (m/s) tell no direction: counters of pulses read zero until the vehicle moves at 0.5 m/s."""
+
+SIDE_SLIP_TIME = 10.0
+"""Seconds for which the course differs from the heading by the same angle."""
+
+
+@njit
+def search_with_wheels(state, payload, gate, settings, work):
+    """Let the speed of the wheels (payload as in ``aiding.wheel``) take part in the search for the heading.
+
+    The velocity of the IMU on the map minus that of the wheels, turned by the unknown angle, is zero. Sideways the
+    vehicle moves by no more than its course differs from its heading.
+    """
+    if state.heading_known == 1 or state.search_started == 0 or settings.use_course == 0 or payload[3] < 0.0:
+        return
+    if abs(payload[0]) < LEAST_SPEED:
+        return
+    rotation = to_matrix(state.attitude)
+    forward, _left, _up = vehicle_axes(state, settings)
+    sway = cross(body_rate(state, rotation), settings.wheel_arm_body)
+    speed = payload[0]
+    motion = rotate(
+        rotation, (speed * forward[0] - sway[0], speed * forward[1] - sway[1], speed * forward[2] - sway[2])
+    )
+    variance = payload[3] + repeated(state, SIDE_SLIP_TIME) * (settings.course_std * speed) ** 2
+    for i in range(3):
+        for j in range(3):
+            work.noise[i, j] = 0.0
+        work.noise[i, i] = variance
+    search_with(state, 2, (0.0, 0.0, 0.0), (-motion[0], -motion[1], -motion[2]), gate, settings, work)

@@ -1,0 +1,210 @@
+"""Heading from acceleration: which way round the level frame of the gyros lies on the map.
+
+Levelled but without heading, the IMU knows every acceleration up to one unknown turn about the vertical. GNSS sees the
+same acceleration on the map. Written with the cosine and the sine of that turn as two states, the whole problem is
+linear: a Kalman filter of position and velocity in east and north, (cos, sin), and what tilt and accelerometer bias
+leave. Nothing has to be guessed: there are no hypotheses that could lock to the wrong one, no direction of travel is
+taken for granted (reversing, side slip, a multirotor), and a robot that has not accelerated has a (cos, sin) near zero,
+which says that nothing is known. Where the length comes out as one, the model holds.
+
+The error of the acceleration in east and north is tilt + R bias, with R the turn of the body since the gyros began.
+The level hides the bias in the tilt, tilt = -R bias then, and when the body turns the bias comes out. Turns about the
+vertical commute, so both are constant in east and north, whatever the unknown turn is.
+
+A uniform heading has mean (0, 0) and variance 1/2 in each of (cos, sin).
+"""
+
+from __future__ import annotations
+
+import math
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.state.layout import ACCEL_BIAS, GYRO_BIAS, SEARCH_SIZE
+from eskf_ros.geodesy.earth import STANDARD_GRAVITY
+from eskf_ros.geodesy.rotation import rotate
+
+COSINE = 4
+TILT = 6
+BIAS = 8
+
+START_VELOCITY_STD = 30.0
+"""Of a robot at the first fix (m/s, per axis)."""
+
+LEAST_ACCELERATION_STD = 0.01
+"""What Coriolis, scale factors and settling springs leave at least (m/s2)."""
+
+LEANING_TIME = 10.0
+"""A body that leans shows another part of its accelerometer bias, for about this long (s)."""
+
+LEAST_LEVEL = 0.1
+"""A body whose x axis is this upright (cosine) turns about it, not with it."""
+
+LENGTH_TOLERANCE = 0.1
+LENGTH_STD = 0.25
+"""(cos, sin) has length one within this and three sigma, and that sigma is small: else the model does not hold."""
+
+
+@njit
+def forget_search(state):
+    """Begin anew with the next fix."""
+    state.search_started = 0
+
+
+@njit
+def begin_search(state, east, north, variance):
+    """Begin at a fix (m, map) of that variance per axis; nothing is known of velocity and heading."""
+    for i in range(TILT):
+        state.search[i] = 0.0
+        for j in range(SEARCH_SIZE):
+            state.search_covariance[i, j] = 0.0
+            state.search_covariance[j, i] = 0.0
+    state.search[0] = east
+    state.search[1] = north
+    for i in range(2):
+        state.search_covariance[i, i] = variance
+        state.search_covariance[2 + i, 2 + i] = START_VELOCITY_STD**2
+        state.search_covariance[COSINE + i, COSINE + i] = 0.5
+    state.search_started = 1
+
+
+@njit
+def turn_of_body(rotation, settings):
+    """Return cosine and sine of the turn of base_link in the level axes, and by how much (sine squared) it leans."""
+    m = settings.imu_to_base
+    forward = rotate(rotation, (m[0, 0], m[0, 1], m[0, 2]))
+    upright = rotate(rotation, (m[2, 0], m[2, 1], m[2, 2]))
+    level = math.sqrt(forward[0] ** 2 + forward[1] ** 2)
+    leaning = upright[0] ** 2 + upright[1] ** 2
+    if level < LEAST_LEVEL:
+        return 1.0, 0.0, leaning
+    return forward[0] / level, forward[1] / level, leaning
+
+
+@njit
+def note_level(state, tilt_variance, accel_bias_variance, rotation, settings):
+    """A new level has this tilt variance (rad2) apart from the accelerometer bias, which it hides in the tilt.
+
+    ``rotation``: from IMU to level axes. What is known of the bias already stays.
+    """
+    x, p = state.search, state.search_covariance
+    if state.search_started == 0:
+        for i in range(BIAS, SEARCH_SIZE):
+            x[i] = 0.0
+            for j in range(SEARCH_SIZE):
+                p[i, j] = 0.0
+                p[j, i] = 0.0
+            p[i, i] = accel_bias_variance
+    c, s, _ = turn_of_body(rotation, settings)
+    x[TILT] = -c * x[BIAS] + s * x[BIAS + 1]
+    x[TILT + 1] = -s * x[BIAS] - c * x[BIAS + 1]
+    for j in range(SEARCH_SIZE):
+        p[TILT, j] = -c * p[BIAS, j] + s * p[BIAS + 1, j]
+        p[TILT + 1, j] = -s * p[BIAS, j] - c * p[BIAS + 1, j]
+    for i in range(SEARCH_SIZE):
+        p[i, TILT] = -c * p[i, BIAS] + s * p[i, BIAS + 1]
+        p[i, TILT + 1] = -s * p[i, BIAS] - c * p[i, BIAS + 1]
+    for i in range(TILT, BIAS):
+        p[i, i] += STANDARD_GRAVITY**2 * tilt_variance + LEAST_ACCELERATION_STD**2
+    state.search_age = 0.0
+
+
+@njit
+def predict_search(state, acceleration, rotation, dt, settings):
+    """Advance by ``dt`` s: ``acceleration`` (m/s2) in axes that are level and turned by the unknown angle.
+
+    ``rotation``: from IMU to these axes.
+    """
+    if state.search_started == 0:
+        return
+    x = state.search
+    c, s, leaning = turn_of_body(rotation, settings)
+    c, s = c * dt, s * dt
+    a, b = acceleration[0] * dt, acceleration[1] * dt
+    for i in range(2):
+        x[i] += dt * x[2 + i]
+    x[2] += a * x[4] - b * x[5] + dt * x[6] + c * x[8] - s * x[9]
+    x[3] += b * x[4] + a * x[5] + dt * x[7] + s * x[8] + c * x[9]
+    p = state.search_covariance
+    for j in range(SEARCH_SIZE):
+        p[0, j] += dt * p[2, j]
+        p[1, j] += dt * p[3, j]
+        p[2, j] += a * p[4, j] - b * p[5, j] + dt * p[6, j] + c * p[8, j] - s * p[9, j]
+        p[3, j] += b * p[4, j] + a * p[5, j] + dt * p[7, j] + s * p[8, j] + c * p[9, j]
+    for i in range(SEARCH_SIZE):
+        p[i, 0] += dt * p[i, 2]
+        p[i, 1] += dt * p[i, 3]
+        p[i, 2] += a * p[i, 4] - b * p[i, 5] + dt * p[i, 6] + c * p[i, 8] - s * p[i, 9]
+        p[i, 3] += b * p[i, 4] + a * p[i, 5] + dt * p[i, 7] + s * p[i, 8] + c * p[i, 9]
+
+    gyro_variance, accel_variance = 0.0, 0.0
+    for i in range(3):
+        gyro_variance = max(gyro_variance, state.covariance[GYRO_BIAS + i, GYRO_BIAS + i])
+        accel_variance = max(accel_variance, state.covariance[ACCEL_BIAS + i, ACCEL_BIAS + i])
+    # A constant rate error turns by its std times the age: variance std^2 age^2, of which this is the growth.
+    drift = settings.gyro_noise_density**2 + 2.0 * gyro_variance * state.search_age
+    velocity_noise = settings.accel_noise_density**2 + LEANING_TIME * leaning * accel_variance
+    for i in range(2):
+        p[2 + i, 2 + i] += velocity_noise * dt
+        p[COSINE + i, COSINE + i] += drift * dt
+        p[TILT + i, TILT + i] += STANDARD_GRAVITY**2 * drift * dt
+        p[BIAS + i, BIAS + i] += settings.accel_bias_random_walk**2 * dt
+    state.search_age += dt
+
+
+@njit
+def update_search(state, first, measured, lever, noise, gate, work):
+    """Fuse east and north of a position (``first`` 0, m) or of a velocity (2, m/s) of the antenna.
+
+    ``lever`` is the antenna from the IMU (or its velocity), in the axes of the acceleration; ``noise`` (3, 3) in map
+    axes; beyond ``gate`` in NIS nothing is fused.
+    """
+    x, p = state.search, state.search_covariance
+    # One row of H has the one, the cosine and the sine: measured = x[first] + lever turned by (cos, sin).
+    h = ((lever[0], -lever[1]), (lever[1], lever[0]))
+    innovation_e = measured[0] - x[first] - h[0][0] * x[4] - h[0][1] * x[5]
+    innovation_n = measured[1] - x[first + 1] - h[1][0] * x[4] - h[1][1] * x[5]
+    east, north = work.projected[0], work.projected[1]
+    for j in range(SEARCH_SIZE):
+        east[j] = p[first, j] + h[0][0] * p[4, j] + h[0][1] * p[5, j]
+        north[j] = p[first + 1, j] + h[1][0] * p[4, j] + h[1][1] * p[5, j]
+    see = east[first] + h[0][0] * east[4] + h[0][1] * east[5] + noise[0, 0]
+    sen = east[first + 1] + h[1][0] * east[4] + h[1][1] * east[5] + noise[0, 1]
+    snn = north[first + 1] + h[1][0] * north[4] + h[1][1] * north[5] + noise[1, 1]
+    determinant = see * snn - sen * sen
+    if not determinant > 0.0:
+        return
+    nis = (snn * innovation_e**2 - 2.0 * sen * innovation_e * innovation_n + see * innovation_n**2) / determinant
+    if nis > gate:
+        return
+    for i in range(SEARCH_SIZE):
+        gain_e = (snn * east[i] - sen * north[i]) / determinant
+        gain_n = (see * north[i] - sen * east[i]) / determinant
+        x[i] += gain_e * innovation_e + gain_n * innovation_n
+        for j in range(i + 1):
+            p[i, j] -= gain_e * east[j] + gain_n * north[j]
+            p[j, i] = p[i, j]
+
+
+@njit
+def turn_found(state):
+    """Return the turn (rad) from the level axes to the map, and its standard deviation; infinite while undecided."""
+    if state.search_started == 0:
+        return 0.0, math.inf
+    c, s = state.search[COSINE], state.search[COSINE + 1]
+    length = math.sqrt(c * c + s * s)
+    if length < 0.5:
+        return 0.0, math.inf
+    along, across = spread(state, c / length, s / length)
+    if along > LENGTH_STD or abs(length - 1.0) > LENGTH_TOLERANCE + 3.0 * along:
+        return 0.0, math.inf
+    return math.atan2(s, c), across / length
+
+
+@njit
+def spread(state, cosine, sine):
+    """Return the standard deviations of (cos, sin) along and across a direction."""
+    p = state.search_covariance
+    cc, cs, ss = p[COSINE, COSINE], p[COSINE, COSINE + 1], p[COSINE + 1, COSINE + 1]
+    along = cosine**2 * cc + 2.0 * cosine * sine * cs + sine**2 * ss
+    across = sine**2 * cc - 2.0 * cosine * sine * cs + cosine**2 * ss
+    return math.sqrt(max(along, 0.0)), math.sqrt(max(across, 0.0))

@@ -1,0 +1,269 @@
+"""Level from gravity, and the gyro bias of a robot at rest."""
+
+from __future__ import annotations
+
+import math
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.alignment.heading import reset_heading
+from eskf_ros.filter.alignment.heading_search import note_level
+from eskf_ros.filter.alignment.warm_start import do_biases_hold
+from eskf_ros.filter.inertial.navigation_frame import heading_of, local_up, shortest_turn, turn_attitude
+from eskf_ros.filter.state.layout import ACCEL_BIAS, ATTITUDE, ERROR_CAPACITY, ERROR_SIZE, GYRO_BIAS
+from eskf_ros.filter.state.time import NEVER
+from eskf_ros.filter.stationarity.residual_motion import can_be_bias, is_moving, note_sway
+from eskf_ros.filter.stationarity.static_window import Window
+from eskf_ros.geodesy.earth import EARTH_RATE, STANDARD_GRAVITY
+from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix, wrapped
+
+DRIFTED = 2.0
+"""Levelling on the way is worth it when it makes the variance of the tilt smaller by this factor."""
+
+UNKNOWN_SPEED = 10.0
+"""Levelling in a turn: the speed (m/s) that makes the centripetal acceleration taken for tilt."""
+
+
+@njit
+def level(state, sums, count, interval, is_rest, settings):
+    """Set roll, pitch and, at rest, the gyro bias from mean readings; heading stays as it was.
+
+    ``sums`` of force (m/s2) and rate (rad/s) over ``count`` samples ``interval`` s apart.
+    """
+    duration = count * interval
+    force = (sums[0] / count, sums[1] / count, sums[2] / count)
+    rate = (sums[3] / count, sums[4] / count, sums[5] / count)
+    is_first = count == state.window_count
+    if is_first:
+        keep_gyro_bias(state)
+    accel_bias, accel_variance, gyro_bias, gyro_variance = known_biases(state, force, rate, duration, is_rest, settings)
+    if is_rest and not can_be_rest(state, rate, gyro_bias, gyro_variance, duration, settings):
+        # What is not known to be rest has to wait as if it were motion.
+        state.still_stamp = NEVER
+        state.still_count = 0
+        if state.level_known == 1 or (state.stamp - state.first_stamp) * 1e-9 < settings.moving_start_after:
+            return
+        is_rest = False
+    force = (force[0] - accel_bias[0], force[1] - accel_bias[1], force[2] - accel_bias[2])
+    strength = math.sqrt(dot(force, force))
+    if strength < 0.5 * STANDARD_GRAVITY:
+        return
+    if is_rest:
+        note_sway(state, is_first, settings)
+        tilt_noise = tilt_noise_at_rest(state, duration, strength, settings)
+        if is_level_better_known(state, accel_variance / strength**2 + tilt_noise):
+            return
+    else:
+        tilt_noise = settings.moving_tilt_std**2 + dot(rate, rate) * (UNKNOWN_SPEED / strength) ** 2
+    heading = heading_of(state, settings)
+    up = local_up(state)
+    measured = rotate(to_matrix(state.attitude), (force[0] / strength, force[1] / strength, force[2] / strength))
+    turn_attitude(state, shortest_turn(measured, up))
+    reset_tilt(state, up, strength, accel_bias, accel_variance, tilt_noise, settings)
+    update_gyro_bias_at_rest(state, gyro_bias, gyro_variance, rate, up, duration, is_rest, settings)
+    # The parameter is true of the start only, not of where a restart finds the robot.
+    if state.level_known == 0 and state.restarts == 0 and not math.isnan(settings.initial_heading):
+        state.heading_known = 1
+        reset_heading(state, settings.initial_heading, settings.initial_heading_std, settings)
+        state.given_stamp = state.stamp
+    state.jump_heading += wrapped(heading_of(state, settings) - heading)
+    state.level_known = 1
+
+
+@njit
+def known_biases(state, force, rate, duration, is_rest, settings):
+    """Return accelerometer bias (m/s2), its variance, gyro bias (rad/s), its variance as known before this level.
+
+    From the last run, if the readings allow it, from the windows before this run of them, else from the parameters.
+    """
+    accel_bias, accel_variance = (0.0, 0.0, 0.0), settings.accel_bias_std**2
+    gyro_bias, gyro_variance = (0.0, 0.0, 0.0), settings.gyro_bias_std**2
+    if do_biases_hold(state, force, rate, duration, is_rest, settings):
+        b, r = settings.remembered_accel_bias, settings.remembered_gyro_bias
+        accel_bias, accel_variance = (b[0], b[1], b[2]), settings.remembered_accel_bias_std**2
+        gyro_bias, gyro_variance = (r[0], r[1], r[2]), settings.remembered_gyro_bias_std**2
+    if state.kept_gyro_variance < gyro_variance:
+        b = state.kept_gyro_bias
+        gyro_bias, gyro_variance = (b[0], b[1], b[2]), state.kept_gyro_variance
+    return accel_bias, accel_variance, gyro_bias, gyro_variance
+
+
+@njit
+def can_be_rest(state, rate, gyro_bias, gyro_variance, duration, settings):
+    """Say whether still readings are those of rest: no even braking, no slow turn, no bias that nobody expected."""
+    if state.moved_first == 1 or is_moving(state):
+        return False
+    return can_be_bias(rate, gyro_bias, math.sqrt(gyro_variance), mean_rate_std(duration, settings))
+
+
+@njit
+def sway_left(sway, duration, settings):
+    """Return the variance that swaying leaves in the mean over ``duration`` (s); ``sway`` is that of one window."""
+    return sway * min(1.0, settings.static_duration / duration)
+
+
+@njit
+def tilt_noise_at_rest(state, duration, strength, settings):
+    """Return the variance (rad2) of the direction of the mean force, without that of the accelerometer bias.
+
+    A bias that walks differs at the end from its mean by a third of the variance that it walks meanwhile.
+    """
+    walked = settings.accel_bias_random_walk**2 * duration / 3.0
+    swayed = sway_left(state.sway_force, duration, settings)
+    return (settings.accel_noise_density**2 / duration + walked + swayed) / strength**2
+
+
+@njit
+def is_level_better_known(state, variance):
+    """Say whether a robot that sways has a level already that is better than the one it would get (rad2)."""
+    known = max(state.covariance[ATTITUDE, ATTITUDE], state.covariance[ATTITUDE + 1, ATTITUDE + 1])
+    return state.sway_force > 0.0 and state.level_known == 1 and known < variance
+
+
+@njit
+def reset_tilt(state, up, strength, accel_bias, accel_variance, tilt_noise, settings):
+    """Write the accelerometer bias, and the covariance of a fresh level.
+
+    The accelerometer bias tilts the level, theta = up x (R dba) / g: the cross covariance says so (Groves, section
+    5.6.2).
+    """
+    rotation = to_matrix(state.attitude)
+    covariance = state.covariance
+    for i in range(ATTITUDE, ERROR_SIZE):
+        for j in range(ERROR_CAPACITY):
+            covariance[i, j] = 0.0
+            covariance[j, i] = 0.0
+    note_level(state, tilt_noise, accel_variance, rotation, settings)
+    heading_variance = settings.initial_heading_std**2 if state.heading_known == 1 else math.pi**2
+    for i in range(3):
+        state.accel_bias[i] = accel_bias[i]
+        covariance[ACCEL_BIAS + i, ACCEL_BIAS + i] = accel_variance
+        # Column i of [up]x R / g.
+        tilt = cross(up, (rotation[0][i], rotation[1][i], rotation[2][i]))
+        for j in range(3):
+            covariance[ATTITUDE + j, ACCEL_BIAS + i] = tilt[j] / strength * accel_variance
+            covariance[ACCEL_BIAS + i, ATTITUDE + j] = tilt[j] / strength * accel_variance
+        for j in range(3):
+            horizontal = -up[i] * up[j]
+            if i == j:
+                horizontal += 1.0
+            covariance[ATTITUDE + i, ATTITUDE + j] = (
+                horizontal * (accel_variance / strength**2 + tilt_noise) + up[i] * up[j] * heading_variance
+            )
+
+
+@njit
+def keep_gyro_bias(state):
+    """Keep what is known of the gyro bias when a run of windows begins: the prior of what its windows say together."""
+    state.kept_gyro_variance = math.inf
+    if state.level_known == 0:
+        return
+    state.kept_gyro_variance = 0.0
+    for i in range(3):
+        state.kept_gyro_bias[i] = state.gyro_bias[i]
+        variance = state.covariance[GYRO_BIAS + i, GYRO_BIAS + i]
+        state.kept_gyro_variance = max(state.kept_gyro_variance, variance)
+
+
+@njit
+def update_level(state, window, settings):
+    """Level at the end of a static window (`Window`), at rest or, when that does not come, while moving."""
+    if state.heading_known == 0 or state.position_known == 0:
+        interval = (state.stamp - state.window_start) * 1e-9 / state.window_count
+        if window == Window.REST:
+            state.still_stamp = state.stamp
+            level(state, state.still_sum, state.still_count, interval, True, settings)
+        elif state.level_known == 0 and (state.stamp - state.first_stamp) * 1e-9 >= settings.moving_start_after:
+            level(state, state.window_sum, state.window_count, interval, False, settings)
+    update_level_in_motion(state, settings)
+
+
+@njit
+def update_level_in_motion(state, settings):
+    """Level on the way, at the end of a window, when the gyros have drifted further than such a level is wrong.
+
+    Of a robot that is never at rest the gyro bias is not known, and without a heading GNSS tells nothing of the tilt.
+    """
+    if state.level_known == 0 or state.heading_known == 1 or state.still_stamp == state.stamp:
+        return
+    n = state.window_count
+    rate_square = (state.window_sum[3] ** 2 + state.window_sum[4] ** 2 + state.window_sum[5] ** 2) / n**2
+    fresh = settings.moving_tilt_std**2 + rate_square * (UNKNOWN_SPEED / STANDARD_GRAVITY) ** 2
+    drifted = max(state.covariance[ATTITUDE, ATTITUDE], state.covariance[ATTITUDE + 1, ATTITUDE + 1])
+    if drifted > DRIFTED * fresh:
+        level(state, state.window_sum, n, settings.static_duration / n, False, settings)
+
+
+@njit
+def mean_rate_std(duration, settings):
+    """Return by how much (rad/s) the mean rate over ``duration`` (s) at rest differs from the gyro bias at the end."""
+    white = settings.gyro_noise_density**2 / duration
+    return math.sqrt(white + settings.gyro_bias_random_walk**2 * duration / 3.0)
+
+
+@njit
+def update_gyro_bias_at_rest(state, prior_bias, prior, mean_rate, up, duration, is_rest, settings):
+    """Estimate the gyro bias from the mean rate at rest; what is not known of the Earth rate enters its sigma.
+
+    The prior (``prior_bias``, rad/s, IMU axes, with variance ``prior``) and the mean are weighed along the vertical
+    and across it, because without heading only the vertical part of the Earth rate is known.
+    """
+    rotation = to_matrix(state.attitude)
+    noise = mean_rate_std(duration, settings) ** 2
+    if is_rest:
+        noise += sway_left(state.sway_rate, duration, settings)
+    earth = state.earth_rate_map
+    vertical_rate = dot(up, earth)
+    horizontal_square = dot(earth, earth) - vertical_rate**2
+    known = (vertical_rate * up[0], vertical_rate * up[1], vertical_rate * up[2])
+    vertical_variance = noise
+    # Of unknown direction: half of its square falls on each horizontal axis.
+    horizontal_variance = noise + 0.5 * horizontal_square
+    if state.datum_known == 0:
+        vertical_variance = noise + EARTH_RATE**2
+        horizontal_variance = noise + EARTH_RATE**2
+    elif state.heading_known == 1:
+        known = (earth[0], earth[1], earth[2])
+        horizontal_variance = noise + horizontal_square * settings.initial_heading_std**2
+    vertical_gain = prior / (prior + vertical_variance) if is_rest and prior > 0.0 else 0.0
+    horizontal_gain = prior / (prior + horizontal_variance) if is_rest and prior > 0.0 else 0.0
+    mean_map = rotate(
+        rotation, (mean_rate[0] - prior_bias[0], mean_rate[1] - prior_bias[1], mean_rate[2] - prior_bias[2])
+    )
+    excess = (mean_map[0] - known[0], mean_map[1] - known[1], mean_map[2] - known[2])
+    vertical = dot(up, excess)
+    bias = rotate_back(
+        rotation,
+        (
+            horizontal_gain * (excess[0] - vertical * up[0]) + vertical_gain * vertical * up[0],
+            horizontal_gain * (excess[1] - vertical * up[1]) + vertical_gain * vertical * up[1],
+            horizontal_gain * (excess[2] - vertical * up[2]) + vertical_gain * vertical * up[2],
+        ),
+    )
+    up_body = rotate_back(rotation, up)
+    across = prior * (1.0 - horizontal_gain)
+    along = prior * (1.0 - vertical_gain)
+    for i in range(3):
+        state.gyro_bias[i] = prior_bias[i] + bias[i]
+        for j in range(3):
+            state.covariance[GYRO_BIAS + i, GYRO_BIAS + j] = (along - across) * up_body[i] * up_body[j]
+        state.covariance[GYRO_BIAS + i, GYRO_BIAS + i] += across
+
+
+@njit
+def reset_level_to_moving(state, settings):
+    """Give tilt and gyro bias the uncertainty of a level taken while moving."""
+    state.still_stamp = NEVER
+    state.still_count = 0
+    note_level(state, settings.moving_tilt_std**2, settings.accel_bias_std**2, to_matrix(state.attitude), settings)
+    up = local_up(state)
+    covariance = state.covariance
+    for i in range(3):
+        state.gyro_bias[i] = 0.0
+        for j in range(ERROR_CAPACITY):
+            covariance[GYRO_BIAS + i, j] = 0.0
+            covariance[j, GYRO_BIAS + i] = 0.0
+        for j in range(3):
+            covariance[ATTITUDE + i, ATTITUDE + j] -= up[i] * up[j] * settings.moving_tilt_std**2
+        covariance[ATTITUDE + i, ATTITUDE + i] += settings.moving_tilt_std**2
+    for i in range(3):
+        covariance[GYRO_BIAS + i, GYRO_BIAS + i] = settings.gyro_bias_std**2

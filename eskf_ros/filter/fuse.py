@@ -1,0 +1,190 @@
+"""One measurement on its way from the timeline to its verdict. ``linearize`` is the list of aids."""
+
+from __future__ import annotations
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.alignment.first_fix import reset_position_to_fix
+from eskf_ros.filter.alignment.heading import reset_heading_from_memory, search_heading
+from eskf_ros.filter.alignment.heading_from_wheels import search_with_wheels
+from eskf_ros.filter.alignment.heading_sensors import update_unknown_heading
+from eskf_ros.filter.alignment.levelling import reset_level_to_moving
+from eskf_ros.filter.history.timeline import open_record
+from eskf_ros.filter.inertial.navigation_frame import heading_of
+from eskf_ros.filter.integrity.fix_tracker import update_track
+from eskf_ros.filter.integrity.monitors import watch_course, watch_field, watch_heading
+from eskf_ros.filter.integrity.receiver_monitor import watch_aid
+from eskf_ros.filter.integrity.recovery import gate_of, note, recover, reset_for_new_solution
+from eskf_ros.filter.measurements import (
+    baro,
+    body_velocity,
+    gnss_position,
+    gnss_velocity,
+    heading,
+    mag,
+    nhc,
+    wheel,
+    zaru,
+    zupt,
+)
+from eskf_ros.filter.measurements.kalman_update import update
+from eskf_ros.filter.output.local_odometry import note_jump
+from eskf_ros.filter.state.augmented_states import join
+from eskf_ros.filter.state.layout import SENSOR_STREAMS, Stream, Verdict
+from eskf_ros.filter.stationarity.detector import update_rest_evidence, watch_wheels
+from eskf_ros.filter.stationarity.static_window import update_evidence_from_fix, update_evidence_from_velocity
+
+UNKNOWN_STREAM = -1
+"""Instead of a size, for a stream without a branch in `linearize`: it is refused with a record, never fused."""
+
+
+@njit
+def fuse(state, aids, i, settings, work):
+    """Offer one measurement to the state and leave the verdict in its record."""
+    if not open_record(aids, i):
+        return
+    aid = aids[i]
+    update_motion_evidence(state, aid, settings)
+    if aid.stream == Stream.GNSS_POSITION and state.level_known == 1 and state.position_known == 0:
+        begin(state, aid, settings)
+    position_before = (state.position_map[0], state.position_map[1], state.position_map[2])
+    heading_before = heading_of(state, settings)
+    offer(state, aid, heading_before, settings, work)
+    note_jump(state, position_before, heading_before, settings)
+
+
+@njit
+def offer(state, aid, heading_before, settings, work):
+    """Fuse one measurement or refuse it; ``heading_before`` (rad) is that of the prediction."""
+    if not is_aligned_for(state, aid.stream):
+        wait_for_alignment(state, aid, settings, work)
+        return
+    if aid.stream == Stream.HEADING and aid.source == heading.IMU_ORIENTATION and state.heading_known == 1:
+        # It is made of the same IMU: good for a start, and nothing new afterwards.
+        aid.verdict = Verdict.INACTIVE
+        return
+    join(state, settings.reach[aid.stream], settings)
+    reset_for_new_solution(state, aid, settings)
+    size = measure(state, aid, heading_before, settings, work)
+    if size == 0:
+        return
+    update_track(state, aid, work)
+    gate = gate_of(state, aid, size, settings)
+    aid.verdict, aid.nis = update(state, size, gate, work)
+    recover(state, aid, size, gate, settings, work)
+    watch_aid(state, aid, size, gate, work, settings)
+    if aid.verdict == Verdict.FUSED and state.heading_known == 0:
+        search_heading(state, aid, gate, settings, work)
+    if aid.stream == Stream.GNSS_POSITION:
+        mag.note_field(state, aid, mag.FIELD)
+    elif aid.stream == Stream.WHEEL:
+        watch_wheels(state, aid)
+
+
+@njit
+def update_motion_evidence(state, aid, settings):
+    """Note what a measurement says of place, course, motion and rest: that counts whatever becomes of it."""
+    if aid.stream == Stream.GNSS_POSITION:
+        if update_evidence_from_fix(state, aid):
+            reset_level_to_moving(state, settings)
+    elif aid.stream == Stream.GNSS_VELOCITY:
+        if update_evidence_from_velocity(state, aid):
+            reset_level_to_moving(state, settings)
+        watch_course(state, aid, heading_of(state, settings), settings)
+    if update_rest_evidence(state, aid):
+        reset_level_to_moving(state, settings)
+
+
+@njit
+def wait_for_alignment(state, aid, settings, work):
+    """Leave a measurement that comes too early; wheels help to find the heading before they are fused."""
+    if aid.stream == Stream.WHEEL:
+        search_with_wheels(state, aid.payload, settings.gate[Stream.WHEEL.value, 2], settings, work)
+        watch_wheels(state, aid)
+    aid.verdict = Verdict.BEFORE_ALIGNMENT if aid.stream < SENSOR_STREAMS else Verdict.INACTIVE
+
+
+@njit
+def begin(state, aid, settings):
+    """Take the position from the first fix, and the heading from memory if the robot is where it was left."""
+    position = (state.position_map[0], state.position_map[1], state.position_map[2])
+    heading_before = heading_of(state, settings)
+    reset_position_to_fix(state, aid.payload)
+    reset_heading_from_memory(state, aid.payload, settings)
+    note_jump(state, position, heading_before, settings)
+
+
+@njit
+def measure(state, aid, heading_before, settings, work):
+    """Write innovation, Jacobian and noise to ``work`` and return the size; 0 and a verdict if it is not to be fused.
+
+    A heading is what the first of those that tell it makes known: the measurement is linearized anew there.
+    """
+    if aid.stream == Stream.MAG:
+        mag.propagate_mag_error(state, heading_before, settings)
+        is_disturbed = mag.update_disturbance(state, aid, settings)
+        watch_field(state, is_disturbed)
+        if is_disturbed:
+            aid.verdict = Verdict.GATE
+            note(state, Stream.MAG.value, aid.source, Verdict.GATE.value)
+            return 0
+    size = linearize(state, aid, settings, work)
+    if size == UNKNOWN_STREAM:
+        aid.verdict = Verdict.DISABLED
+        return 0
+    if size == 0:
+        aid.verdict = Verdict.INACTIVE
+        return 0
+    if aid.stream in (Stream.HEADING, Stream.MAG):
+        watch_heading(state, aid, work)
+        if state.heading_known == 0:
+            if not update_unknown_heading(state, aid, settings, work):
+                aid.verdict = Verdict.BEFORE_ALIGNMENT
+                return 0
+            size = linearize(state, aid, settings, work)
+    for k in range(size):
+        aid.innovation[k] = work.innovation[k]
+    aid.dof = size
+    return size
+
+
+@njit
+def is_aligned_for(state, stream):
+    """Say whether the start-up is far enough for a measurement of a stream."""
+    if state.level_known == 0:
+        return False
+    if stream == Stream.GNSS_POSITION:
+        return True
+    if stream in (Stream.GNSS_VELOCITY, Stream.HEADING, Stream.BARO):
+        return state.position_known == 1
+    if stream == Stream.MAG:
+        return state.position_known == 1 and state.field_known == 1
+    return state.position_known == 1 and state.heading_known == 1
+
+
+@njit
+def linearize(state, aid, settings, work):
+    """Write innovation, Jacobian and noise of one measurement to ``work``; return its size. The list of aids.
+
+    Size 0: the measurement says nothing in this state. `UNKNOWN_STREAM`: nothing here knows what it measures.
+    """
+    if aid.stream == Stream.GNSS_POSITION:
+        return gnss_position.linearize(state, aid.payload, aid.source, settings, work)
+    if aid.stream == Stream.WHEEL:
+        return wheel.linearize(state, aid.payload, settings, work)
+    if aid.stream == Stream.BODY_VELOCITY:
+        return body_velocity.linearize(state, aid.payload, settings, work)
+    if aid.stream == Stream.ZUPT:
+        return zupt.linearize(state, settings, work)
+    if aid.stream == Stream.ZARU:
+        return zaru.linearize(state, settings, work)
+    if aid.stream == Stream.NHC:
+        return nhc.linearize(state, settings, work)
+    if aid.stream == Stream.HEADING:
+        return heading.linearize(state, aid.payload, aid.source, settings, work)
+    if aid.stream == Stream.MAG:
+        return mag.linearize(state, aid.payload, settings, work)
+    if aid.stream == Stream.BARO:
+        return baro.linearize(state, aid.payload, aid.source, settings, work)
+    if aid.stream == Stream.GNSS_VELOCITY:
+        return gnss_velocity.linearize(state, aid.payload, aid.source, settings, work)
+    return UNKNOWN_STREAM

@@ -1,0 +1,81 @@
+"""The door: what a message must be before it enters the timeline. A bad one is named and never applied."""
+
+from __future__ import annotations
+
+import math
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.state.layout import Verdict
+
+VARIANCES = (3, 6, 8)
+"""Where the variances of the three values are in the payload."""
+
+ABSENT = -1.0
+"""The variance of an axis that was not measured."""
+
+
+@njit
+def admit(offered, values, covariance, stand_in, scale, std_floor, may_lack_axes):
+    """Write three values and the conditioned covariance to the payload of the record on offer; return its door.
+
+    ``covariance`` row-major 3x3, in the unit of the values squared; when ``stand_in`` has a positive first element it
+    is the diagonal used instead. Scaled, then lifted to the floor (one for each axis): raising the diagonal of a
+    positive semidefinite matrix keeps it one. An axis that may lack and whose variance is negative or no number was
+    not measured: its value becomes 0 and its variance -1.
+    """
+    payload = offered[0].payload
+    for i in range(3):
+        payload[i] = values[i]
+    for i in range(3, len(payload)):
+        payload[i] = 0.0
+    payload[3] = covariance[0]
+    payload[4] = covariance[1]
+    payload[5] = covariance[2]
+    payload[6] = covariance[4]
+    payload[7] = covariance[5]
+    payload[8] = covariance[8]
+    if stand_in[0] > 0.0:
+        for i in range(3, 9):
+            payload[i] = 0.0
+        payload[3] = stand_in[0]
+        payload[6] = stand_in[1]
+        payload[8] = stand_in[2]
+    lacking = 0
+    if may_lack_axes:
+        lacking = take_out_absent_axes(payload)
+    for i in range(9):
+        if not math.isfinite(payload[i]):
+            return Verdict.NON_FINITE
+    lowest = min(payload[3], payload[6], payload[8])
+    for i in range(3, 9):
+        payload[i] *= scale
+    payload[3] = max(payload[3], std_floor[0] * std_floor[0])
+    payload[6] = max(payload[6], std_floor[1] * std_floor[1])
+    payload[8] = max(payload[8], std_floor[2] * std_floor[2])
+    xx, xy, xz = payload[3], payload[4], payload[5]
+    yy, yz, zz = payload[6], payload[7], payload[8]
+    determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+    for i in range(3):
+        if lacking & (1 << i):
+            payload[VARIANCES[i]] = ABSENT
+    if lowest < 0.0 or not (xx * yy - xy * xy > 0.0 and determinant > 0.0) or lacking == 7:
+        return Verdict.BAD_COVARIANCE
+    return Verdict.WAITING
+
+
+@njit
+def take_out_absent_axes(payload):
+    """Zero what belongs to axes with a negative variance or none; return them as bits."""
+    lacking = 0
+    for i in range(3):
+        if not payload[VARIANCES[i]] >= 0.0:
+            lacking |= 1 << i
+            payload[i] = 0.0
+            payload[VARIANCES[i]] = 0.0
+    if lacking & 3:
+        payload[4] = 0.0
+    if lacking & 5:
+        payload[5] = 0.0
+    if lacking & 6:
+        payload[7] = 0.0
+    return lacking

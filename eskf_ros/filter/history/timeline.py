@@ -1,0 +1,410 @@
+"""The timeline: what the estimator was told in the last seconds, in one total order, and checkpoints to go back to.
+
+The order is (stamp, stream rank, source, door, payload). IMU samples and aids wait in two sorted buffers. A checkpoint
+is a copy of the whole state right after an IMU sample and before the aids of the same stamp. What arrives behind the
+state only marks how far to go back: the next advance restores the newest checkpoint before it and applies again all
+that follows, so the result is a function of the sorted contents alone.
+
+Constraints (rest, no side slip), which no sensor sends, lie among the aids on a grid of stamps, wherever IMU samples
+are close together.
+
+A message is in time if its stamp is not older than the newest IMU stamp (the frontier) minus the window.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.state.layout import CONSTRAINT_INTERVAL, SENSOR_STREAMS, Verdict, allocate
+from eskf_ros.filter.state.time import NEVER
+
+EARLY_AIDS = 4096
+"""So many aids may wait for the first IMU sample."""
+
+CHECKPOINT_SPACING = 16
+"""IMU samples from one checkpoint to the next: what a rewind does again in vain, at the most.
+
+A copy of the state costs as much as half a sample.
+"""
+
+LARGEST_FORCE = 1000.0
+LARGEST_RATE = 100.0
+"""What no strapdown IMU on a robot reads (m/s2, rad/s)."""
+
+LARGEST_JUMP = 10_000_000_000
+"""A stamp this far (ns) from the frontier is not believed ..."""
+
+JUMP_CONFIRMATIONS = 10
+LONGEST_STEP = 1_000_000_000
+"""... until so many IMU samples in a row go on from there, each at most this much (ns) after the one before."""
+
+
+@njit
+def go_back_to(timeline, stamp):
+    """Make the next advance start from a checkpoint not later than ``stamp``."""
+    timeline.rewind_to = min(timeline.rewind_to, stamp)
+
+
+@njit
+def oldest_in_time(timeline):
+    """Return the oldest stamp that is still in time: within the window, and after the last barrier."""
+    return max(timeline.frontier - timeline.window, timeline.barrier)
+
+
+@njit
+def rewind(states, checkpoints, timeline, blank):
+    """Restore the newest checkpoint not later than what was asked for, and drop the later ones."""
+    if timeline.rewind_to > states[0].stamp:
+        timeline.rewind_to = -NEVER
+        return
+    count = timeline.checkpoint_count
+    while count > 0 and checkpoints[count - 1].stamp > timeline.rewind_to:
+        count -= 1
+    timeline.checkpoint_count = count
+    timeline.since_checkpoint = 0
+    timeline.rewind_to = -NEVER
+    if count > 0:
+        states[0] = checkpoints[count - 1]
+    else:
+        states[0] = blank[0]
+
+
+@njit
+def save_checkpoint(states, checkpoints, timeline):
+    """Keep a copy of the state after every few IMU samples."""
+    if timeline.checkpoint_count > 0:
+        timeline.since_checkpoint += 1
+        if timeline.since_checkpoint < CHECKPOINT_SPACING:
+            return
+    checkpoints[timeline.checkpoint_count] = states[0]
+    timeline.checkpoint_count += 1
+    timeline.since_checkpoint = 0
+
+
+@njit
+def is_bad_value(force, rate):
+    """Say whether an IMU sample is not finite or beyond anything a robot does."""
+    for i in range(3):
+        if not (abs(force[i]) < LARGEST_FORCE and abs(rate[i]) < LARGEST_RATE):
+            return True
+    return False
+
+
+@njit
+def is_far(timeline, stamp, started):
+    """Say whether an IMU stamp is so far from the frontier that one of the two must be wrong.
+
+    Behind it only until the attitude is level (``started``) or a barrier stands: so far nothing was given out, and the
+    frontier may be a first stamp that was never true. Later what is behind is late. No message in time is ever far.
+    """
+    if timeline.frontier == NEVER:
+        return False
+    behind = timeline.frontier - stamp
+    if started == 1 or timeline.barrier != NEVER:
+        return behind < -LARGEST_JUMP
+    return behind < -LARGEST_JUMP or behind > max(LARGEST_JUMP, timeline.window)
+
+
+@njit
+def confirm_jump(timeline, stamp):
+    """Count a sample far from the frontier; say whether enough of them in a row follow each other."""
+    follows = 0 < stamp - timeline.elsewhere_stamp <= LONGEST_STEP
+    timeline.elsewhere_count = timeline.elsewhere_count + 1 if follows else 1
+    timeline.elsewhere_stamp = stamp
+    return timeline.elsewhere_count >= JUMP_CONFIRMATIONS
+
+
+@njit
+def begin_again(aids, timeline):
+    """Take back all IMU samples: the next advance starts from the blank state, with the aids that sensors sent."""
+    kept = timeline.recorded
+    for i in range(timeline.recorded, timeline.aid_count):
+        if aids[i].stream < SENSOR_STREAMS:
+            aids[kept] = aids[i]
+            kept += 1
+    timeline.aid_count = kept
+    timeline.imu_count = 0
+    timeline.frontier = NEVER
+    timeline.published = NEVER
+    timeline.furthest_late = 0
+    go_back_to(timeline, NEVER)
+
+
+@njit
+def insert_imu(imu, aids, timeline, locals_, settings_, stamps, specific_force, angular_rate, first):
+    """Sort samples ``first`` and following into the buffer; return how many were taken before it was full.
+
+    Each is checked at the door: finite, possible, stamp neither too old nor absurdly far from the others. Of two with
+    one stamp the one with the smaller bits stays. The constraints on the grid come with the samples around them.
+    """
+    t = timeline[0]
+    gap = min(round(settings_[0].imu_gap * 1e9), CONSTRAINT_INTERVAL)
+    k = first
+    while k < len(stamps) and t.imu_count < len(imu):
+        stamp = stamps[k]
+        force = specific_force[k]
+        rate = angular_rate[k]
+        k += 1
+        t.imu_offered += 1
+        if is_bad_value(force, rate):
+            t.imu_bad_value += 1
+            continue
+        if stamp <= 0:
+            t.imu_bad_stamp += 1
+            continue
+        if is_far(t, stamp, locals_[0].started):
+            if not confirm_jump(t, stamp):
+                t.imu_bad_stamp += 1
+                continue
+            if stamp < t.frontier:
+                begin_again(aids, t)
+        elif stamp < oldest_in_time(t):
+            t.imu_late += 1
+            t.furthest_late = max(t.furthest_late, t.frontier - stamp)
+            continue
+        t.elsewhere_count = 0
+        place = t.imu_count
+        while place > 0 and imu[place - 1].stamp > stamp:
+            place -= 1
+        if place > 0 and imu[place - 1].stamp == stamp:
+            t.imu_duplicate += 1
+            if not is_smaller_sample(force, rate, imu[place - 1]):
+                continue
+            place -= 1
+        else:
+            before = imu[place - 1].stamp if place > 0 else NEVER
+            after = imu[place].stamp if place < t.imu_count else NEVER
+            if before == NEVER or after == NEVER or after - before > gap:
+                add_constraints(aids, t, settings_[0], before, stamp, gap)
+                add_constraints(aids, t, settings_[0], stamp, after, gap)
+            for i in range(t.imu_count, place, -1):
+                imu[i] = imu[i - 1]
+            t.imu_count += 1
+        imu[place].stamp = stamp
+        for i in range(3):
+            imu[place].specific_force[i] = force[i]
+            imu[place].angular_rate[i] = rate[i]
+        if stamp <= t.frontier:
+            go_back_to(t, imu[place - 1].stamp if place > 0 else NEVER)
+        t.frontier = max(t.frontier, stamp)
+    return k
+
+
+@njit
+def add_constraints(aids, t, settings, after, until, gap):
+    """Put the constraints that are switched on to the grid points in (``after``, ``until``], two IMU stamps.
+
+    None where one of them is `NEVER`, and none in a gap (ns): nobody knows what the robot did there.
+    """
+    if after == NEVER or until == NEVER or until - after > gap:
+        return
+    point = (after // CONSTRAINT_INTERVAL + 1) * CONSTRAINT_INTERVAL
+    while point <= until:
+        for stream in range(SENSOR_STREAMS, len(settings.constrains)):
+            if settings.constrains[stream] == 1:
+                add_constraint(aids, t, stream, point)
+        point += CONSTRAINT_INTERVAL
+
+
+@njit
+def add_constraint(aids, t, stream, stamp):
+    """Sort one constraint into the buffer, which has room."""
+    place = t.aid_count
+    while place > 0 and (
+        aids[place - 1].stamp > stamp or (aids[place - 1].stamp == stamp and aids[place - 1].stream > stream)
+    ):
+        place -= 1
+    for i in range(t.aid_count, place, -1):
+        aids[i] = aids[i - 1]
+    aid = aids[place]
+    aid.stamp = stamp
+    aid.arrival = stamp
+    aid.stream = stream
+    aid.source = 0
+    aid.door = Verdict.WAITING
+    aid.verdict = Verdict.WAITING
+    aid.dof = 0
+    aid.told = 0
+    for i in range(len(aid.payload)):
+        aid.payload[i] = 0.0
+    t.aid_count += 1
+
+
+@njit
+def is_smaller_sample(force, rate, other):
+    """Say whether a sample comes before another of the same stamp."""
+    for i in range(3):
+        if force[i] != other.specific_force[i]:
+            return force[i] < other.specific_force[i]
+    for i in range(3):
+        if rate[i] != other.angular_rate[i]:
+            return rate[i] < other.angular_rate[i]
+    return False
+
+
+@njit
+def comes_before(a, b):
+    """Say whether aid ``a`` comes before aid ``b``: stamp, stream, source, whether the door let it in, payload."""
+    if a.stamp != b.stamp:
+        return a.stamp < b.stamp
+    if a.stream != b.stream:
+        return a.stream < b.stream
+    if a.source != b.source:
+        return a.source < b.source
+    if a.door != b.door:
+        return a.door < b.door
+    for i in range(len(a.payload)):
+        if a.payload[i] != b.payload[i] and not (math.isnan(a.payload[i]) and math.isnan(b.payload[i])):
+            return a.payload[i] < b.payload[i] or math.isnan(b.payload[i])
+    return False
+
+
+@njit
+def offer_aid(aids, timeline, offered, stamp, arrival, stream, source, door):
+    """Head the record whose payload is on offer, and sort it into the buffer as `insert_aid` does."""
+    aid = offered[0]
+    aid.stamp, aid.arrival, aid.stream, aid.source = stamp, arrival, stream, source
+    aid.door, aid.verdict, aid.told = door, door, 0
+    # So it stays in the record of a measurement that waits in vain.
+    aid.dof, aid.nis = 0, math.nan
+    for k in range(3):
+        aid.innovation[k] = math.nan
+    return insert_aid(aids, timeline, offered)
+
+
+@njit
+def insert_aid(aids, timeline, offered):
+    """Sort one offered measurement into the buffer, which has room; return the verdict when the door stays shut.
+
+    Too old for the window, or absurdly far ahead of the newest IMU sample: then it never enters.
+    """
+    t = timeline[0]
+    aid = offered[0]
+    if aid.stamp <= 0 or (t.frontier != NEVER and aid.stamp > t.frontier + LARGEST_JUMP):
+        return Verdict.BAD_STAMP
+    if t.frontier == NEVER and t.aid_count >= EARLY_AIDS:
+        return Verdict.BEFORE_ALIGNMENT
+    if t.frontier != NEVER and aid.stamp < oldest_in_time(t):
+        t.furthest_late = max(t.furthest_late, t.frontier - aid.stamp)
+        return Verdict.OUTSIDE_HISTORY
+    place = t.aid_count
+    while place > 0 and comes_before(aid, aids[place - 1]):
+        place -= 1
+    for i in range(t.aid_count, place, -1):
+        aids[i] = aids[i - 1]
+    aids[place] = aid
+    t.aid_count += 1
+    go_back_to(t, aid.stamp)
+    return Verdict.WAITING
+
+
+@njit
+def is_duplicate(aids, i):
+    """Say whether an earlier message of the same source and stream has the same stamp."""
+    if i == 0:
+        return False
+    aid, other = aids[i], aids[i - 1]
+    is_same = other.stamp == aid.stamp and other.stream == aid.stream and other.source == aid.source
+    return is_same and other.door == 0
+
+
+@njit
+def open_record(aids, i):
+    """Begin anew with the record of a measurement; say whether it may be offered to the state."""
+    aid = aids[i]
+    aid.verdict = aid.door
+    aid.nis = math.nan
+    aid.dof = 0
+    for k in range(3):
+        aid.innovation[k] = math.nan
+    if aid.door != Verdict.WAITING:
+        return False
+    if is_duplicate(aids, i):
+        aid.verdict = Verdict.DUPLICATE
+        return False
+    return True
+
+
+@njit
+def forget(states, imu, aids, checkpoints, timeline):
+    """Drop what no message in time can reach: all before the newest checkpoint older than the window."""
+    t = timeline[0]
+    keep = 0
+    while keep + 1 < t.checkpoint_count and checkpoints[keep + 1].stamp < t.frontier - t.window:
+        keep += 1
+    if t.checkpoint_count == 0 or checkpoints[keep].stamp >= t.frontier - t.window:
+        return
+    # The sample of the checkpoint itself stays: it is the predecessor of what may still be inserted after it.
+    imu_gone = checkpoints[keep].imu_next - 1
+    aid_gone = min(checkpoints[keep].aid_next, t.recorded)
+    for i in range(imu_gone, t.imu_count):
+        imu[i - imu_gone] = imu[i]
+    for i in range(aid_gone, t.aid_count):
+        aids[i - aid_gone] = aids[i]
+    for i in range(keep, t.checkpoint_count):
+        checkpoints[i - keep] = checkpoints[i]
+    t.imu_count -= imu_gone
+    t.aid_count -= aid_gone
+    t.recorded -= aid_gone
+    t.checkpoint_count -= keep
+    for i in range(t.checkpoint_count):
+        checkpoints[i].imu_next -= imu_gone
+        checkpoints[i].aid_next -= aid_gone
+    states[0].imu_next -= imu_gone
+    states[0].aid_next -= aid_gone
+
+
+@njit
+def raise_barrier(states, blank, timeline):
+    """Make the present the beginning: nothing older is accepted, and nothing rewinds past it. Buffers are emptied.
+
+    Before the first IMU sample there is no present: what waits stays.
+    """
+    t = timeline[0]
+    if t.frontier == NEVER:
+        blank[0] = states[0]
+        return
+    states[0].imu_next = 0
+    states[0].aid_next = 0
+    blank[0] = states[0]
+    t.imu_count = 0
+    t.aid_count = 0
+    t.recorded = 0
+    t.checkpoint_count = 0
+    t.barrier = t.frontier + 1
+
+
+@njit
+def take_final(aids, timeline, out, everything):
+    """Copy the records that can no longer change to ``out`` (long enough); return how many."""
+    t = timeline[0]
+    count = 0
+    while t.recorded < t.aid_count:
+        aid = aids[t.recorded]
+        if not everything and (t.frontier == NEVER or aid.stamp >= t.frontier - t.window):
+            break
+        if aid.verdict == Verdict.INACTIVE:
+            t.recorded += 1
+            continue
+        out[count].stamp = aid.stamp
+        out[count].arrival = aid.arrival
+        out[count].stream = aid.stream
+        out[count].source = aid.source
+        out[count].verdict = aid.verdict
+        out[count].dof = aid.dof
+        out[count].nis = aid.nis
+        for i in range(3):
+            out[count].innovation[i] = aid.innovation[i]
+        count += 1
+        t.recorded += 1
+    return count
+
+
+def doubled(buffer: np.ndarray) -> np.ndarray:
+    """Return a buffer of twice the size that starts with the contents of this one."""
+    bigger = allocate(buffer.dtype, 2 * len(buffer))
+    bigger[: len(buffer)] = buffer
+    return bigger

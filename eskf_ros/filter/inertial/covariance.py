@@ -1,0 +1,146 @@
+"""Covariance of the error state over one IMU interval, in blocks.
+
+Error dynamics of the local Earth-fixed frame with the attitude error theta on the map side, q_true = dq(theta) q
+(Groves, section 14.2.3, written for the local frame; Sola, section 7.2):
+
+    d/dt dp    = dv
+    d/dt dv    = theta x (R f) - R dba - 2 Omega x dv + gradient(g) dp
+    d/dt theta = -R dbg - Omega x theta
+    d/dt dba, d/dt dbg = random walks
+
+One interval is integrated to second order: the attitude error of mid-interval enters the velocity, the mean of old
+and new velocity error the position. That is a transition of nine rows which never becomes a matrix: it is applied to
+the columns of P, and again to the columns of the transpose of the result. The bias rows do not change, so the second
+round has nine columns only. Optional errors, of which the core knows nothing, are carried by their columns alone.
+"""
+
+from __future__ import annotations
+
+import math
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.state.layout import ACCEL_BIAS, ERROR_SIZE
+from eskf_ros.geodesy.earth import SEMI_MAJOR_AXIS
+from eskf_ros.geodesy.rotation import rotate
+
+
+@njit
+def apply_transition(columns, out, count, rotation, force, up, gravity_gradient, earth_rate, dt, coupling):
+    """Write the nine moving rows of one interval's transition times the first ``count`` columns to ``out``.
+
+    ``columns`` has error size rows. ``rotation`` body to map at mid-interval, ``force`` specific force (m/s2, map),
+    ``up`` unit vector (map), ``gravity_gradient`` gravity over Earth radius (1/s2), ``earth_rate`` (rad/s, map), ``dt``
+    in s. ``coupling`` 0 cuts velocity off from attitude and accelerometer bias (unknown heading), 1 is the full model.
+    """
+    r00, r01, r02 = rotation[0][0] * dt, rotation[0][1] * dt, rotation[0][2] * dt
+    r10, r11, r12 = rotation[1][0] * dt, rotation[1][1] * dt, rotation[1][2] * dt
+    r20, r21, r22 = rotation[2][0] * dt, rotation[2][1] * dt, rotation[2][2] * dt
+    a00, a01, a02 = coupling * r00, coupling * r01, coupling * r02
+    a10, a11, a12 = coupling * r10, coupling * r11, coupling * r12
+    a20, a21, a22 = coupling * r20, coupling * r21, coupling * r22
+    # Half, because old and new attitude error are added below.
+    half = 0.5 * dt * coupling
+    fx, fy, fz = half * force[0], half * force[1], half * force[2]
+    ex, ey, ez = earth_rate[0] * dt, earth_rate[1] * dt, earth_rate[2] * dt
+    cx, cy, cz = 2.0 * ex, 2.0 * ey, 2.0 * ez
+    ux, uy, uz = up[0], up[1], up[2]
+    gradient = gravity_gradient * dt
+    wx, wy, wz = 3.0 * gradient * ux, 3.0 * gradient * uy, 3.0 * gradient * uz
+    h = 0.5 * dt
+    for j in range(count):
+        px, py, pz = columns[0, j], columns[1, j], columns[2, j]
+        vx, vy, vz = columns[3, j], columns[4, j], columns[5, j]
+        tx, ty, tz = columns[6, j], columns[7, j], columns[8, j]
+        ax, ay, az = columns[9, j], columns[10, j], columns[11, j]
+        gx, gy, gz = columns[12, j], columns[13, j], columns[14, j]
+        new_tx = tx - (r00 * gx + r01 * gy + r02 * gz) - (ey * tz - ez * ty)
+        new_ty = ty - (r10 * gx + r11 * gy + r12 * gz) - (ez * tx - ex * tz)
+        new_tz = tz - (r20 * gx + r21 * gy + r22 * gz) - (ex * ty - ey * tx)
+        sx, sy, sz = tx + new_tx, ty + new_ty, tz + new_tz
+        vertical = ux * px + uy * py + uz * pz
+        new_vx = (
+            vx
+            + (sy * fz - sz * fy)
+            - (a00 * ax + a01 * ay + a02 * az)
+            - (cy * vz - cz * vy)
+            + (wx * vertical - gradient * px)
+        )
+        new_vy = (
+            vy
+            + (sz * fx - sx * fz)
+            - (a10 * ax + a11 * ay + a12 * az)
+            - (cz * vx - cx * vz)
+            + (wy * vertical - gradient * py)
+        )
+        new_vz = (
+            vz
+            + (sx * fy - sy * fx)
+            - (a20 * ax + a21 * ay + a22 * az)
+            - (cx * vy - cy * vx)
+            + (wz * vertical - gradient * pz)
+        )
+        out[0, j] = px + h * (vx + new_vx)
+        out[1, j] = py + h * (vy + new_vy)
+        out[2, j] = pz + h * (vz + new_vz)
+        out[3, j], out[4, j], out[5, j] = new_vx, new_vy, new_vz
+        out[6, j], out[7, j], out[8, j] = new_tx, new_ty, new_tz
+
+
+@njit
+def add_noise(covariance, velocity_noise, attitude_noise, dt, settings):
+    """Add ``dt`` s of process noise; velocity (m2/s3) and attitude (rad2/s) noise are spectral densities."""
+    for i in range(3):
+        p, v, t, a, g = i, 3 + i, 6 + i, 9 + i, 12 + i
+        covariance[p, p] += velocity_noise * dt * dt * dt / 3.0
+        covariance[p, v] += velocity_noise * dt * dt / 2.0
+        covariance[v, p] += velocity_noise * dt * dt / 2.0
+        covariance[v, v] += velocity_noise * dt
+        covariance[t, t] += attitude_noise * dt
+        covariance[a, a] += settings.accel_bias_random_walk**2 * dt
+        covariance[g, g] += settings.gyro_bias_random_walk**2 * dt
+
+
+@njit
+def propagate_covariance(covariance, size, rotation, force, gravity, earth_rate, dt, coupling, work):
+    """Apply one interval's transition on both sides of the covariance; arguments as for ``apply_transition``.
+
+    ``size`` errors are in use; ``gravity`` is the vector (m/s2, map); the result is exactly symmetric.
+    """
+    strength = math.sqrt(gravity[0] * gravity[0] + gravity[1] * gravity[1] + gravity[2] * gravity[2])
+    up = (-gravity[0] / strength, -gravity[1] / strength, -gravity[2] / strength)
+    gradient = strength / SEMI_MAJOR_AXIS
+    half = work.half
+    apply_transition(covariance, half, ERROR_SIZE, rotation, force, up, gradient, earth_rate, dt, coupling)
+    for i in range(ACCEL_BIAS):
+        for j in range(ERROR_SIZE):
+            work.turned[j, i] = half[i, j]
+    apply_transition(work.turned, covariance, ACCEL_BIAS, rotation, force, up, gradient, earth_rate, dt, coupling)
+    for i in range(ACCEL_BIAS):
+        for j in range(i):
+            covariance[i, j] = covariance[j, i]
+        for j in range(ACCEL_BIAS, ERROR_SIZE):
+            covariance[i, j] = half[i, j]
+            covariance[j, i] = half[i, j]
+    if size > ERROR_SIZE:
+        columns = covariance[:, ERROR_SIZE:size]
+        count = size - ERROR_SIZE
+        apply_transition(columns, columns, count, rotation, force, up, gradient, earth_rate, dt, coupling)
+        for i in range(ACCEL_BIAS):
+            for j in range(ERROR_SIZE, size):
+                covariance[j, i] = covariance[i, j]
+
+
+@njit
+def transform_error(covariance, block, matrix):
+    """Replace the three errors from index ``block`` by ``matrix`` (3x3 row tuples) times themselves."""
+    for j in range(len(covariance)):
+        error = rotate(matrix, (covariance[block, j], covariance[block + 1, j], covariance[block + 2, j]))
+        for i in range(3):
+            covariance[block + i, j] = error[i]
+    for j in range(len(covariance)):
+        error = rotate(matrix, (covariance[j, block], covariance[j, block + 1], covariance[j, block + 2]))
+        for i in range(3):
+            covariance[j, block + i] = error[i]
+    for i in range(3):
+        for j in range(i):
+            covariance[block + i, block + j] = covariance[block + j, block + i]

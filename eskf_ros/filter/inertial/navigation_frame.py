@@ -1,0 +1,137 @@
+"""The local frame, and what is up in it: the datum, turns of the attitude with its error."""
+
+from __future__ import annotations
+
+import math
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.inertial.covariance import transform_error
+from eskf_ros.filter.inertial.strapdown import gravity_map
+from eskf_ros.filter.state.layout import ATTITUDE, ERROR_SIZE, POSITION, VELOCITY
+from eskf_ros.geodesy.earth import EARTH_RATE, east_north_up_to_ecef, ecef_to_geodetic, geodetic_to_ecef
+from eskf_ros.geodesy.rotation import (
+    cross,
+    dot,
+    from_matrix,
+    from_rotation_vector,
+    multiply,
+    normalized,
+    rotate,
+    rotate_back,
+    to_matrix,
+    to_rotation_vector,
+)
+
+
+@njit
+def set_datum(state, latitude, longitude, altitude):
+    """Latch the local frame: East-North-Up at a geodetic position (rad, rad, m)."""
+    state.datum[0] = latitude
+    state.datum[1] = longitude
+    state.datum[2] = altitude
+    origin = geodetic_to_ecef(latitude, longitude, altitude)
+    rotation = east_north_up_to_ecef(latitude, longitude)
+    earth_rate = rotate_back(rotation, (0.0, 0.0, EARTH_RATE))
+    for i in range(3):
+        state.origin_ecef[i] = origin[i]
+        state.earth_rate_map[i] = earth_rate[i]
+        for j in range(3):
+            state.map_to_ecef[i, j] = rotation[i][j]
+    state.datum_known = 1
+
+
+@njit
+def local_up(state):
+    """Return the unit vector against gravity (map axes) at the current position."""
+    gravity = gravity_map(state, (state.position_map[0], state.position_map[1], state.position_map[2]))
+    scale = -1.0 / math.sqrt(dot(gravity, gravity))
+    return (gravity[0] * scale, gravity[1] * scale, gravity[2] * scale)
+
+
+@njit
+def turn_attitude(state, rotation_vector):
+    """Turn the attitude by a rotation vector in map axes, and its error with it (the error is in map axes too)."""
+    turn = from_rotation_vector(rotation_vector)
+    attitude = (state.attitude[0], state.attitude[1], state.attitude[2], state.attitude[3])
+    attitude = normalized(multiply(turn, attitude))
+    for i in range(4):
+        state.attitude[i] = attitude[i]
+    transform_error(state.covariance, ATTITUDE, to_matrix(turn))
+
+
+@njit
+def move_datum(state, latitude, longitude, altitude, settings):
+    """Describe the same state in the local frame of another datum (rad, rad, m): an exact rotation and shift."""
+    old = east_north_up_to_ecef(state.datum[0], state.datum[1])
+    offset = rotate(old, state.position_map)
+    ecef = (state.origin_ecef[0] + offset[0], state.origin_ecef[1] + offset[1], state.origin_ecef[2] + offset[2])
+    set_datum(state, latitude, longitude, altitude)
+    origin = state.origin_ecef
+    # Columns of the rotation from old to new map, as rows: the images of the old axes.
+    east = rotate_back(state.map_to_ecef, (old[0][0], old[1][0], old[2][0]))
+    north = rotate_back(state.map_to_ecef, (old[0][1], old[1][1], old[2][1]))
+    up = rotate_back(state.map_to_ecef, (old[0][2], old[1][2], old[2][2]))
+    turn = ((east[0], north[0], up[0]), (east[1], north[1], up[1]), (east[2], north[2], up[2]))
+    position = rotate_back(state.map_to_ecef, (ecef[0] - origin[0], ecef[1] - origin[1], ecef[2] - origin[2]))
+    velocity = rotate(turn, state.velocity_map)
+    for i in range(3):
+        state.position_map[i] = position[i]
+        state.velocity_map[i] = velocity[i]
+    transform_error(state.covariance, POSITION, turn)
+    transform_error(state.covariance, VELOCITY, turn)
+    place = settings.position_error_at
+    if place < state.error_size:
+        transform_error(state.covariance, place, turn)
+        lasting = state.optional[place - ERROR_SIZE : place - ERROR_SIZE + 3]
+        lasting[0], lasting[1], lasting[2] = rotate(turn, (lasting[0], lasting[1], lasting[2]))
+    turn_attitude(state, to_rotation_vector(from_matrix(turn)))
+
+
+@njit
+def shortest_turn(a, b):
+    """Return the shortest rotation vector that turns unit vector ``a`` into ``b``."""
+    axis = cross(a, b)
+    sine = math.sqrt(dot(axis, axis))
+    cosine = dot(a, b)
+    if sine < 1e-9:
+        if cosine > 0.0:
+            return (0.0, 0.0, 0.0)
+        # Opposite: half a turn about any perpendicular axis.
+        if abs(a[0]) < 0.9:
+            axis = cross(a, (1.0, 0.0, 0.0))
+        else:
+            axis = cross(a, (0.0, 1.0, 0.0))
+        scale = math.pi / math.sqrt(dot(axis, axis))
+        return (axis[0] * scale, axis[1] * scale, axis[2] * scale)
+    scale = math.atan2(sine, cosine) / sine
+    return (axis[0] * scale, axis[1] * scale, axis[2] * scale)
+
+
+@njit
+def local_east_north_up_to_ecef(state):
+    """Return the rotation from East-North-Up at the current position to ECEF."""
+    offset = rotate(state.map_to_ecef, state.position_map)
+    geodetic = ecef_to_geodetic(
+        state.origin_ecef[0] + offset[0], state.origin_ecef[1] + offset[1], state.origin_ecef[2] + offset[2]
+    )
+    return east_north_up_to_ecef(geodetic[0], geodetic[1])
+
+
+@njit
+def body_rate(state, rotation):
+    """Return the body rate relative to the Earth (rad/s, body axes)."""
+    earth = rotate_back(rotation, state.earth_rate_map)
+    return (
+        state.angular_rate[0] - state.gyro_bias[0] - earth[0],
+        state.angular_rate[1] - state.gyro_bias[1] - earth[1],
+        state.angular_rate[2] - state.gyro_bias[2] - earth[2],
+    )
+
+
+@njit
+def heading_of(state, settings):
+    """Return the heading (rad, map: 0 = x, counter-clockwise) of the x axis of base_link."""
+    # The x axis of base_link in IMU axes is the first row of imu_to_base.
+    m = settings.imu_to_base
+    forward = rotate(to_matrix(state.attitude), (m[0, 0], m[0, 1], m[0, 2]))
+    return math.atan2(forward[1], forward[0])

@@ -1,0 +1,214 @@
+"""Monitors: what is wrong with a whole stream, judged over windows and never by a single message."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.state.layout import Stream
+from eskf_ros.filter.state.time import NEVER
+from eskf_ros.filter.stationarity.residual_motion import can_be_bias
+from eskf_ros.geodesy.earth import STANDARD_GRAVITY
+from eskf_ros.geodesy.rotation import dot, rotate, wrapped
+
+NO_GRAVITY = 0.5
+"""Below this part of gravity on average the accelerometer cannot be a strapdown one in m/s2, at rest or not."""
+
+GRAVITY_TOLERANCE = 0.2
+UPRIGHT_COSINE = 0.7
+FASTEST_TURN = 15.0
+"""At rest gravity is within this part of its value and within 45 degrees of the z axis of base_link; nothing that
+navigates turns this fast (rad/s) for seconds."""
+
+SAME_RATE = 0.1
+BIASED_WINDOWS = 3
+"""A rate that changes by less than this part from window to window, through so many, is a bias: nothing turns so."""
+
+MEMORY = 0.99
+LASTING_COUNT = 40.0
+ALIKE = 0.9
+FAR_OFF_DEG = 30.0
+"""Angles are remembered for some hundred messages; at least so many, so much alike, and on average so far from zero
+are no accident."""
+
+LONG_REFUSED = 30.0
+REFUSED_CAUSES = {
+    Stream.WHEEL: "wheel.time_offset, wheel.position, the scale of the speed (estimate.wheel_scale), or slip",
+    Stream.BODY_VELOCITY: "body_velocity.mount_rpy_deg, body_velocity.mount_position, body_velocity.time_offset, or "
+    "covariances that claim too much",
+}
+"""What may be wrong with velocities that are refused for so long (s) while they come."""
+
+
+@njit
+def watch_input(state, still, settings):
+    """Judge the full stillness window: strength of gravity, its direction in base_link, size of the rates."""
+    n = state.window_count
+    force = (state.window_sum[0] / n, state.window_sum[1] / n, state.window_sum[2] / n)
+    rate = (state.window_sum[3] / n, state.window_sum[4] / n, state.window_sum[5] / n)
+    strength = math.sqrt(dot(force, force))
+    state.windows += 1
+    odd = strength < NO_GRAVITY * STANDARD_GRAVITY
+    if still and abs(strength / STANDARD_GRAVITY - 1.0) > GRAVITY_TOLERANCE:
+        odd = True
+    if odd:
+        state.odd_gravity_windows += 1
+        state.odd_gravity = strength
+    elif still:
+        watch_bias(state, rate, settings)
+        state.rest_windows += 1
+        force_base = rotate(settings.imu_to_base, force)
+        if force_base[2] < UPRIGHT_COSINE * strength:
+            state.tilted_windows += 1
+            for i in range(3):
+                state.tilted_force[i] = force_base[i]
+    if math.sqrt(dot(rate, rate)) > FASTEST_TURN:
+        state.fast_windows += 1
+
+
+@njit
+def watch_bias(state, rate, settings):
+    """Count still windows in a row with one mean rate (rad/s) that is too large for what is expected of the bias."""
+    nothing = (0.0, 0.0, 0.0)
+    if can_be_bias(rate, nothing, settings.gyro_bias_std, 0.0):
+        state.biased_windows = 0
+        return
+    last = state.biased_rate
+    change = (rate[0] - last[0], rate[1] - last[1], rate[2] - last[2])
+    if dot(change, change) > SAME_RATE**2 * dot(rate, rate):
+        state.biased_windows = 0
+    state.biased_windows += 1
+    for i in range(3):
+        state.biased_rate[i] = rate[i]
+
+
+@njit
+def note_contrast(sums, angle):
+    """Add an angle (rad) to sums of cosine, sine and count that forget."""
+    sums[0] = MEMORY * sums[0] + math.cos(angle)
+    sums[1] = MEMORY * sums[1] + math.sin(angle)
+    sums[2] = MEMORY * sums[2] + 1.0
+
+
+@njit
+def watch_heading(state, aid, work):
+    """Compare a heading of the dual antenna or the magnetometer, described by ``work``, with the estimate."""
+    if aid.source == 0 and state.heading_known == 1 and aid.payload[3] > 0.0:
+        kind = 1 if aid.stream == Stream.MAG else 0
+        note_contrast(state.heading_contrast[kind], work.innovation[0])
+
+
+@njit
+def watch_field(state, is_disturbed):
+    """Count the readings of the magnetometer that cannot be the Earth's field; the counts forget."""
+    state.fields = MEMORY * state.fields + 1.0
+    state.disturbed_fields = MEMORY * state.disturbed_fields + (1.0 if is_disturbed else 0.0)
+
+
+@njit
+def watch_course(state, aid, heading, settings):
+    """Compare the course of a GNSS velocity with the heading (rad) of a vehicle that travels along its x axis."""
+    east, north = aid.payload[0], aid.payload[1]
+    std = math.sqrt(max(aid.payload[3], aid.payload[6]))
+    fast = math.hypot(east, north) > max(settings.course_min_speed, 10.0 * std)
+    if settings.use_course == 1 and state.heading_known == 1 and fast:
+        note_contrast(state.course_contrast, wrapped(math.atan2(north, east) - heading))
+
+
+def _lasting_difference(sums: np.ndarray) -> float | None:
+    """Return the mean (deg) of angles that were noted, if they were many, all alike and far from zero."""
+    cosine, sine, count = (float(value) for value in sums)
+    if count < LASTING_COUNT or math.hypot(cosine, sine) < ALIKE * count:
+        return None
+    mean = math.degrees(math.atan2(sine, cosine))
+    return mean if abs(mean) > FAR_OFF_DEG else None
+
+
+def is_heading_contradicted(state: np.void) -> bool:
+    """Say whether the dual antenna or the magnetometer tell another heading than the estimate for long."""
+    return any(_lasting_difference(sums) is not None for sums in state["heading_contrast"])
+
+
+def _refused_complaints(state: np.void) -> list[str]:
+    """Name the aids that are refused without end: one sentence each."""
+    found = []
+    for stream, causes in REFUSED_CAUSES.items():
+        count = int(state["aid_rejected"][stream, 0])
+        since = (int(state["stamp"]) - int(state["aid_fused_stamp"][stream, 0])) * 1e-9
+        last = (int(state["stamp"]) - int(state["aid_stamp"][stream, 0])) * 1e-9
+        if count > LASTING_COUNT and since > LONG_REFUSED > last:
+            found.append(f"{count} messages of {stream.name.lower()} in a row contradict the estimate: {causes}")
+    return found
+
+
+def _heading_complaints(state: np.void) -> list[str]:
+    found = []
+    if state["disturbed_fields"] > max(LASTING_COUNT, ALIKE * float(state["fields"])):
+        strength, inclination = (float(value) for value in state["field_found"])
+        found.append(
+            f"the magnetic field is {strength * 1e6:.0f} uT and dips by {math.degrees(inclination):.0f} deg, that of "
+            f"the Earth is {float(state['field_strength']) * 1e6:.0f} uT and dips by "
+            f"{math.degrees(state['field_inclination']):.0f} deg: does mag.mount_rpy_deg match its axes (a driver may "
+            "give north-east-down), is it in T, and is it calibrated?"
+        )
+    if state["heading_disputed"] and not state["heading_known"]:
+        found.append(
+            "the dual antenna and the heading that was given (alignment.initial_heading_deg, warm start, initialpose) "
+            "contradict each other: which one is right is known when the robot speeds up or turns"
+        )
+    dual_antenna, magnetometer = state["heading_contrast"]
+    given = ""
+    if state["given_stamp"] != NEVER:
+        given = " Or is the heading wrong that was given (alignment.initial_heading_deg, warm start, initialpose)?"
+    difference = _lasting_difference(magnetometer)
+    if difference is not None:
+        found.append(
+            f"the headings of the magnetometer differ from the estimate by {difference:.0f} deg: does "
+            "mag.mount_rpy_deg match its axes (a driver may give north-east-down), and is it calibrated?" + given
+        )
+    difference = _lasting_difference(dual_antenna)
+    if difference is not None:
+        found.append(
+            f"the headings of the dual antenna differ from the estimate by {difference:.0f} deg: are the antennas "
+            "swapped, does heading.mount_rpy_deg match the baseline, and is yaw 0 = east, counter-clockwise?" + given
+        )
+    difference = _lasting_difference(state["course_contrast"])
+    if difference is not None and dual_antenna[2] > 0.0:
+        found.append(
+            f"the vehicle travels at {difference:.0f} deg to the heading of the dual antenna: are the antennas "
+            "swapped, does heading.mount_rpy_deg match the baseline, and is yaw 0 = east, counter-clockwise? "
+            "(If it is made to move like this: alignment.use_course false.)"
+        )
+    return found
+
+
+def complaints(state: np.void) -> list[str]:
+    """Say in one sentence each what is wrong with the IMU stream, and what to do; empty when nothing is."""
+    found = []
+    if state["odd_gravity_windows"] > max(1, int(state["windows"]) // 4):
+        strength = float(state["odd_gravity"])
+        cause = "is its scale right?"
+        if strength < 0.05 * STANDARD_GRAVITY:
+            cause = "the driver removes gravity; publish the raw specific force (REP-145: +g up at rest)"
+        elif abs(strength - 1.0) < GRAVITY_TOLERANCE:
+            cause = "it is in units of g; REP-103 wants m/s2"
+        found.append(f"the accelerometer reads {strength:.2f} m/s2 where gravity is {STANDARD_GRAVITY:.2f}: {cause}")
+    if state["biased_windows"] >= BIASED_WINDOWS:
+        x, y, z = np.degrees(state["biased_rate"])
+        found.append(
+            f"at rest the gyro reads ({x:.2f}, {y:.2f}, {z:.2f}) deg/s, more than imu.gyro_bias_std allows for: raise "
+            "it, or calibrate the gyro"
+        )
+    if state["tilted_windows"] > max(1, int(state["rest_windows"]) // 4):
+        x, y, z = (float(value) for value in state["tilted_force"])
+        found.append(
+            f"at rest gravity is ({x:.1f}, {y:.1f}, {z:.1f}) m/s2 in base_link, not along +z: imu.mount_rpy_deg does "
+            "not match the mounting, or the driver publishes North-East-Down axes"
+        )
+    if state["fast_windows"] > 0:
+        found.append(
+            f"the gyro reads more than {FASTEST_TURN:.0f} rad/s for seconds: is it in deg/s? REP-103 wants rad/s"
+        )
+    return found + _heading_complaints(state) + _refused_complaints(state)

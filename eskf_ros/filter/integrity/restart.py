@@ -1,0 +1,36 @@
+"""The alignment starts again: after a long silence of the IMU, or when the estimate is not to be believed."""
+
+from __future__ import annotations
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.alignment.heading_search import forget_search
+from eskf_ros.filter.integrity.fix_tracker import forget_tracks
+from eskf_ros.filter.state.time import NEVER
+
+
+@njit
+def restart(state):
+    """Start the alignment again; only the datum stays."""
+    state.restarts += 1
+    forget_search(state)
+    forget_tracks(state)
+    state.hint_count = 0
+    state.given_stamp = NEVER
+    state.rejected_fixes = 0
+    state.recent_resets = 0
+    state.level_known = 0
+    state.position_known = 0
+    state.heading_known = 0
+    state.first_stamp = NEVER
+    state.window_start = NEVER
+    state.still_stamp = NEVER
+    state.still_count = 0
+    # What was learnt of the receivers was learnt with an attitude that is not believed any more.
+    state.fault_stamp = NEVER
+    state.fault_information[:] = 0.0
+    state.fault_evidence[:] = 0.0
+    for i in range(2):
+        state.clock_known[i] = 0
+    for i in range(3):
+        state.position_map[i] = 0.0
+        state.velocity_map[i] = 0.0

@@ -1,0 +1,120 @@
+"""The main loop of the filter: predict, detect rest, align, fuse, publish."""
+
+from __future__ import annotations
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.alignment.levelling import update_level
+from eskf_ros.filter.fuse import fuse
+from eskf_ros.filter.history.timeline import rewind, save_checkpoint
+from eskf_ros.filter.inertial.navigation_frame import heading_of
+from eskf_ros.filter.integrity.monitors import watch_input
+from eskf_ros.filter.integrity.restart import restart
+from eskf_ros.filter.output.global_odometry import write_odometry
+from eskf_ros.filter.output.local_odometry import carry, measure_step, note_jump
+from eskf_ros.filter.predict import propagate
+from eskf_ros.filter.state.time import NEVER, SECOND
+from eskf_ros.filter.stationarity.detector import add_to_block
+from eskf_ros.filter.stationarity.residual_motion import add_to_part
+from eskf_ros.filter.stationarity.static_window import Window, close_static_window, update_static_window
+from eskf_ros.filter.tight.epoch import end_of_epoch, fuse_ranges, is_range
+
+LONGEST_GAP = 5 * SECOND
+"""The IMU was silent for longer (ns): nothing is left of attitude and velocity, start again."""
+
+
+@njit
+def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, locals_, rows):
+    """Run the filter over all that waits, in the total order; return how many rows were written.
+
+    One row for every IMU sample that is new and first on the output grid.
+    """
+    t, settings, work, local = timeline[0], settings_[0], work_[0], locals_[0]
+    rewind(states, checkpoints, t, blank)
+    state = states[0]
+    row_count = 0
+    while state.imu_next < t.imu_count:
+        sample = imu[state.imu_next]
+
+        while state.aid_next < t.aid_count and aids[state.aid_next].stamp < sample.stamp:
+            predict(state, aids[state.aid_next].stamp, sample, settings, work)
+            state.aid_next = fuse_next(state, aids, t.aid_count, settings, work)
+
+        previous_stamp = state.imu_stamp
+        predict(state, sample.stamp, sample, settings, work)
+        take_sample(state, sample)
+        measure_step(state, settings)
+        update_rest(state, settings)
+        add_to_block(state, settings)
+        save_checkpoint(states, checkpoints, t)
+
+        is_new = sample.stamp > t.published and state.level_known == 1
+        if is_new:
+            carry(local, state, settings)
+
+        while state.aid_next < t.aid_count and aids[state.aid_next].stamp == sample.stamp:
+            state.aid_next = fuse_next(state, aids, t.aid_count, settings, work)
+
+        if is_new and is_on_grid(previous_stamp, sample.stamp, settings.output_interval):
+            write_odometry(state, local, settings, rows[row_count])
+            row_count += 1
+        t.published = max(t.published, sample.stamp)
+    return row_count
+
+
+@njit
+def predict(state, stamp, sample, settings, work):
+    """Bring the state to ``stamp``, at or before the IMU sample that comes next."""
+    if state.level_known == 0:
+        return
+    if sample.stamp - state.imu_stamp > LONGEST_GAP:
+        position = (state.position_map[0], state.position_map[1], state.position_map[2])
+        restart(state)
+        note_jump(state, position, heading_of(state, settings), settings)
+        return
+    propagate(state, stamp, sample, settings, work)
+
+
+@njit
+def update_rest(state, settings):
+    """Add the newest IMU sample to the static window; judge the IMU and level when the window is full."""
+    add_to_part(state)
+    window = update_static_window(state, settings)
+    if window != Window.OPEN:
+        watch_input(state, window != Window.MOTION, settings)
+        update_level(state, window, settings)
+        close_static_window(state)
+
+
+@njit
+def take_sample(state, sample):
+    """Make an IMU sample the newest reading of the state."""
+    if state.imu_stamp != NEVER:
+        state.imu_interval = (sample.stamp - state.imu_stamp) * 1e-9
+    state.imu_stamp = sample.stamp
+    state.stamp = sample.stamp
+    state.imu_next += 1
+    for i in range(3):
+        state.earlier_force[i] = state.imu_force[i]
+        state.earlier_rate[i] = state.imu_rate[i]
+        state.imu_force[i] = sample.specific_force[i]
+        state.imu_rate[i] = sample.angular_rate[i]
+        state.specific_force[i] = sample.specific_force[i]
+        state.angular_rate[i] = sample.angular_rate[i]
+
+
+@njit
+def fuse_next(state, aids, count, settings, work):
+    """Offer the next of ``count`` measurements, signals by the epoch; return the index of the one that follows."""
+    i = state.aid_next
+    if not is_range(aids[i].stream):
+        fuse(state, aids, i, settings, work)
+        return i + 1
+    end = end_of_epoch(aids, i, count)
+    fuse_ranges(state, aids, i, end, settings, work)
+    return end
+
+
+@njit
+def is_on_grid(previous_stamp, stamp, interval):
+    """Say whether a multiple of ``interval`` (0: everything) lies in (previous_stamp, stamp]."""
+    return interval == 0 or previous_stamp == NEVER or stamp // interval != previous_stamp // interval

@@ -1,0 +1,84 @@
+"""GNSS position of the antenna.
+
+Payload: latitude, longitude (rad), ellipsoidal altitude (m), covariance in East-North-Up at the fix (m2: ee, en, eu,
+nn, nu, uu). Groves, section 14.3.1, for the local frame and a map-side attitude error.
+
+A share of the variance may belong to an error that lasts: per axis it is the standard deviation of the fix times the
+root of the share times an optional state of unit variance (first-order Gauss-Markov).
+"""
+
+from __future__ import annotations
+
+import math
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.measurements.jacobians import clear, set_east_north_up_covariance, set_identity, set_minus_cross
+from eskf_ros.filter.state.layout import ATTITUDE, ERROR_SIZE, POSITION
+from eskf_ros.geodesy.earth import east_north_up_to_ecef, geodetic_to_ecef
+from eskf_ros.geodesy.rotation import rotate, rotate_back, to_matrix
+
+SIZE = 3
+
+NOTABLE_SCATTER = 2.0
+"""Fixes whose scatter has more than so many times the variance they claim are not believed it."""
+
+
+@njit
+def position_of_fix(state, payload):
+    """Return the map position (m) of a fix."""
+    fix = geodetic_to_ecef(payload[0], payload[1], payload[2])
+    offset = (fix[0] - state.origin_ecef[0], fix[1] - state.origin_ecef[1], fix[2] - state.origin_ecef[2])
+    return rotate_back(state.map_to_ecef, offset)
+
+
+@njit
+def predict(state, source, settings):
+    """Return the map position (m) of the antenna of receiver ``source``: position + R lever_arm."""
+    lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[source])
+    return (state.position_map[0] + lever[0], state.position_map[1] + lever[1], state.position_map[2] + lever[2])
+
+
+@njit
+def noise_factor(state, source):
+    """Return the factor on the covariances of a receiver's fixes that their scatter asks for (see ``recovery``)."""
+    return state.scatter[source] if state.scatter[source] > NOTABLE_SCATTER else 1.0
+
+
+@njit
+def add_lasting_error(state, settings, work):
+    """Give the share of the noise that lasts to its optional states, if they are in use."""
+    place = settings.position_error_at
+    if place >= state.error_size:
+        return
+    for i in range(SIZE):
+        std = math.sqrt(settings.correlated_share * work.noise[i, i])
+        work.jacobian[i, place + i] = std
+        work.innovation[i] -= std * state.optional[place - ERROR_SIZE + i]
+    for i in range(SIZE):
+        for j in range(SIZE):
+            work.noise[i, j] *= 1.0 - settings.correlated_share
+
+
+@njit
+def linearize(state, payload, source, settings, work):
+    """Write innovation, Jacobian and noise of one fix to ``work``; return the number of scalars."""
+    clear(work)
+    measured = position_of_fix(state, payload)
+    predicted = predict(state, source, settings)
+    for i in range(3):
+        work.innovation[i] = measured[i] - predicted[i]
+    set_identity(work.jacobian, POSITION)
+    set_east_north_up_covariance(work.noise, state, east_north_up_to_ecef(payload[0], payload[1]), payload, 3)
+    factor = noise_factor(state, source)
+    for i in range(SIZE):
+        for j in range(SIZE):
+            work.noise[i, j] *= factor
+    add_lasting_error(state, settings, work)
+    lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[source])
+    if state.heading_known == 0:
+        # The lever arm points anywhere around the vertical: its horizontal length is an error of the prediction.
+        for i in range(2):
+            work.noise[i, i] += lever[0] ** 2 + lever[1] ** 2
+    else:
+        set_minus_cross(work.jacobian, ATTITUDE, lever)
+    return SIZE

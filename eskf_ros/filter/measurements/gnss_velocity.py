@@ -1,0 +1,66 @@
+"""GNSS velocity of the antenna relative to the Earth.
+
+Payload: velocity east, north, up (m/s), covariance (m2/s2: ee, en, eu, nn, nu, uu). The antenna moves with
+velocity + R (omega x lever_arm), omega the body rate relative to the Earth, free of the gyro bias (Groves, section
+14.3.1; here the Jacobian also has the attitude, through R and through the Earth rate in body axes, and the gyro bias).
+"""
+
+from __future__ import annotations
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.inertial.navigation_frame import body_rate, local_east_north_up_to_ecef
+from eskf_ros.filter.measurements.jacobians import clear, set_east_north_up_covariance, set_identity, set_minus_cross
+from eskf_ros.filter.state.layout import ATTITUDE, GYRO_BIAS, VELOCITY
+from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix
+
+SIZE = 3
+
+
+@njit
+def predict(state, source, settings):
+    """Return the velocity (m/s, map) of the antenna of receiver ``source``."""
+    rotation = to_matrix(state.attitude)
+    sway = rotate(rotation, cross(body_rate(state, rotation), settings.lever_arms_body[source]))
+    return (state.velocity_map[0] + sway[0], state.velocity_map[1] + sway[1], state.velocity_map[2] + sway[2])
+
+
+@njit
+def linearize(state, payload, source, settings, work):
+    """Write innovation, Jacobian and noise of one velocity to ``work``; return the number of scalars."""
+    clear(work)
+    local_to_ecef = local_east_north_up_to_ecef(state)
+    measured = rotate_back(state.map_to_ecef, rotate(local_to_ecef, (payload[0], payload[1], payload[2])))
+    predicted = predict(state, source, settings)
+    for i in range(3):
+        work.innovation[i] = measured[i] - predicted[i]
+    set_identity(work.jacobian, VELOCITY)
+    set_east_north_up_covariance(work.noise, state, local_to_ecef, payload, 3)
+
+    rotation = to_matrix(state.attitude)
+    arm = settings.lever_arms_body[source]
+    lever = rotate(rotation, arm)
+    sway = rotate(rotation, cross(body_rate(state, rotation), arm))
+    # The gyro reading of this instant carries the white noise of one sample.
+    rate_variance = settings.gyro_noise_density**2 / state.imu_interval
+    for i in range(3):
+        for j in range(3):
+            work.noise[i, j] -= rate_variance * lever[i] * lever[j]
+        work.noise[i, i] += rate_variance * dot(lever, lever)
+    if state.heading_known == 0:
+        for i in range(3):
+            work.noise[i, i] += dot(sway, sway)
+        return SIZE
+    set_minus_cross(work.jacobian, ATTITUDE, sway)
+    # An attitude error also turns the Earth rate into the body: [lever]x [Earth rate]x theta.
+    earth = state.earth_rate_map
+    along = dot(lever, earth)
+    for i in range(3):
+        for j in range(3):
+            work.jacobian[i, ATTITUDE + j] += earth[i] * lever[j]
+        work.jacobian[i, ATTITUDE + i] -= along
+    # R [lever_arm]x for the gyro bias.
+    for i in range(3):
+        row = cross((rotation[i][0], rotation[i][1], rotation[i][2]), arm)
+        for j in range(3):
+            work.jacobian[i, GYRO_BIAS + j] = row[j]
+    return SIZE

@@ -1,0 +1,142 @@
+"""The one measurement update every aid goes through: gate, gain, Joseph, inject, reset."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.inertial.covariance import transform_error
+from eskf_ros.filter.state.layout import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, VELOCITY, Verdict
+from eskf_ros.geodesy.rotation import from_rotation_vector, left_jacobian, multiply, normalized
+
+
+@njit
+def update(state, size, gate, work):
+    """Fuse ``size`` scalars described by ``work.jacobian``, ``work.innovation``, ``work.noise``, ``work.shared``.
+
+    Returns the verdict and the normalised innovation squared; the state changes only when the verdict is fused.
+    ``gate`` is the largest normalised innovation squared that is accepted. Joseph form with the full product
+    (I - K H) P (I - K H)' + K R K' (Groves, eq. 3.58), evaluated through its rank-``size`` parts, and extended by the
+    covariance C of noise and errors (Brown and Hwang, Introduction to Random Signals, section 5.5). The inverse of the
+    innovation covariance stays in ``work.innovation_covariance``.
+    """
+    project(state, size, work)
+    if not invert_positive(work.innovation_covariance, size):
+        return Verdict.BAD_COVARIANCE, np.nan
+    inverse = work.innovation_covariance
+    nis = 0.0
+    for a in range(size):
+        for b in range(size):
+            nis += work.innovation[a] * inverse[a, b] * work.innovation[b]
+    if not nis <= gate:
+        return Verdict.GATE, nis
+    for i in range(state.error_size):
+        correction = 0.0
+        for a in range(size):
+            gain = 0.0
+            for b in range(size):
+                gain += work.projected[b, i] * inverse[b, a]
+            work.gain[i, a] = gain
+            correction += gain * work.innovation[a]
+        work.correction[i] = correction
+    joseph(state, size, work)
+    inject(state, work.correction)
+    # The error is now about the injected attitude (Sola, section 6.3.1, with the full Jacobian).
+    turn = (work.correction[ATTITUDE], work.correction[ATTITUDE + 1], work.correction[ATTITUDE + 2])
+    transform_error(state.covariance, ATTITUDE, left_jacobian(turn))
+    return Verdict.FUSED, nis
+
+
+@njit
+def project(state, size, work):
+    """Write H P + C' to ``work.projected`` and H P H' + H C + C' H' + R to ``work.innovation_covariance``."""
+    covariance, n = state.covariance, state.error_size
+    for a in range(size):
+        for j in range(n):
+            work.projected[a, j] = work.shared[a, j]
+        for i in range(n):
+            h = work.jacobian[a, i]
+            if h != 0.0:
+                for j in range(n):
+                    work.projected[a, j] += h * covariance[i, j]
+    for a in range(size):
+        for b in range(a + 1):
+            total = work.noise[a, b]
+            for j in range(n):
+                total += work.projected[a, j] * work.jacobian[b, j] + work.shared[b, j] * work.jacobian[a, j]
+            work.innovation_covariance[a, b] = total
+            work.innovation_covariance[b, a] = total
+
+
+@njit
+def invert_positive(matrix, size):
+    """Invert a symmetric positive definite matrix in place (Gauss-Jordan); return False if it is not one."""
+    for k in range(size):
+        pivot = matrix[k, k]
+        if not (pivot > 0.0 and pivot < math.inf):
+            return False
+        matrix[k, k] = 1.0
+        for j in range(size):
+            matrix[k, j] /= pivot
+        for i in range(size):
+            if i != k:
+                factor = matrix[i, k]
+                matrix[i, k] = 0.0
+                for j in range(size):
+                    matrix[i, j] -= factor * matrix[k, j]
+    for i in range(size):
+        for j in range(i):
+            mean = 0.5 * (matrix[i, j] + matrix[j, i])
+            matrix[i, j] = mean
+            matrix[j, i] = mean
+    return True
+
+
+@njit
+def joseph(state, size, work):
+    """Replace P by (I - K H) P (I - K H)' + K R K' - (I - K H) C K' - K C' (I - K H)', exactly symmetric."""
+    covariance, n, gain = state.covariance, state.error_size, work.gain
+    for i in range(n):
+        for a in range(size):
+            k = gain[i, a]
+            for j in range(n):
+                covariance[i, j] -= k * work.projected[a, j]
+    # ``covariance`` is (I - K H) P - K C' now. All that is missing is (this H' - K R + C - K H C) K'.
+    for a in range(size):
+        for b in range(size):
+            work.noise_seen[a, b] = work.noise[a, b]
+            for j in range(n):
+                work.noise_seen[a, b] += work.jacobian[a, j] * work.shared[b, j]
+    for i in range(n):
+        for a in range(size):
+            total = work.shared[a, i]
+            for j in range(n):
+                total += covariance[i, j] * work.jacobian[a, j]
+            for b in range(size):
+                total -= gain[i, b] * work.noise_seen[b, a]
+            work.residual_gain[i, a] = total
+    for i in range(n):
+        for j in range(i + 1):
+            total = covariance[i, j]
+            for a in range(size):
+                total -= work.residual_gain[i, a] * gain[j, a]
+            covariance[i, j] = total
+            covariance[j, i] = total
+
+
+@njit
+def inject(state, correction):
+    """Move the error estimate into the nominal state (closed loop); the error state is zero afterwards."""
+    for i in range(3):
+        state.position_map[i] += correction[POSITION + i]
+        state.velocity_map[i] += correction[VELOCITY + i]
+        state.accel_bias[i] += correction[ACCEL_BIAS + i]
+        state.gyro_bias[i] += correction[GYRO_BIAS + i]
+    turn = from_rotation_vector((correction[ATTITUDE], correction[ATTITUDE + 1], correction[ATTITUDE + 2]))
+    attitude = normalized(multiply(turn, (state.attitude[0], state.attitude[1], state.attitude[2], state.attitude[3])))
+    for i in range(4):
+        state.attitude[i] = attitude[i]
+    for i in range(state.error_size - ERROR_SIZE):
+        state.optional[i] += correction[ERROR_SIZE + i]

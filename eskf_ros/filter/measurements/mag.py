@@ -1,0 +1,155 @@
+"""Magnetometer: the heading, and nothing else, from the direction of the field in the level plane.
+
+Payload: field in the axes of the sensor (T) and its covariance (T2). The field b of the Earth, freed of the hard iron
+and turned to local East-North-Up with the estimated attitude, should point to magnetic north, at the angle
+pi/2 - declination from east. Its angle atan2(b_n, b_e) is wrong by the yaw error, by the tilt error times the tangent
+of the inclination, by the white noise, and by what iron and currents do.
+
+Of the latter, what is fixed to the body is the hard iron, an optional state (T, axes of the sensor). The rest is an
+optional state (rad) whose deviation never shrinks with time alone, since a parked robot measures the same wrong field
+again and again: it is a first-order Gauss-Markov process in the angle turned and the distance travelled. A field whose
+strength or inclination cannot be the Earth's is disturbed and not used at all. Strength and inclination do not correct
+the estimate: they would tell tilt, which the accelerometers know better.
+"""
+
+from __future__ import annotations
+
+import math
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.inertial.navigation_frame import local_east_north_up_to_ecef
+from eskf_ros.filter.measurements.jacobians import clear, set_attitude_row, to_local
+from eskf_ros.filter.state.layout import ERROR_SIZE, Verdict
+from eskf_ros.geodesy.rotation import dot, rotate, rotate_back, to_matrix, wrapped
+
+WEAKEST_LEVEL = 2.0e-6
+"""Near the magnetic poles the level part of the field (T) tells no heading."""
+
+TURN = 1.0
+"""After turning by so much (rad) another error is measured."""
+
+STEP = 0.2
+"""The least way that counts (1 is as far as the error lasts)."""
+
+FIELD = 12
+"""In the payload of a fix: whether the Earth's field is known there, declination, inclination (rad), strength (T)."""
+
+HOLD = 1_000_000_000
+"""A field that was disturbed is not used for so long (ns): at its edges a disturbance looks like the Earth's field."""
+
+SIGMAS = 3.0
+
+
+@njit
+def earth_field_body(state, payload, settings):
+    """Return the measured field (T, IMU axes) without the hard iron."""
+    m = (payload[0], payload[1], payload[2])
+    place = settings.magnetic_bias_at
+    if place < state.error_size:
+        b = state.optional[place - ERROR_SIZE : place - ERROR_SIZE + 3]
+        m = (m[0] - b[0], m[1] - b[1], m[2] - b[2])
+    return rotate(settings.mag_to_imu, m)
+
+
+@njit
+def predict(state, payload, settings):
+    """Return the angle (rad) from east of the measured field in the level plane, freed of the errors that are known."""
+    b = to_local(state, local_east_north_up_to_ecef(state), earth_field_body(state, payload, settings))
+    return math.atan2(b[1], b[0]) - state.optional[settings.mag_error_at - ERROR_SIZE]
+
+
+@njit
+def linearize(state, payload, settings, work):
+    """Write innovation, Jacobian and noise of one field to ``work``; return the number of scalars."""
+    clear(work)
+    local_to_ecef = local_east_north_up_to_ecef(state)
+    b = to_local(state, local_to_ecef, earth_field_body(state, payload, settings))
+    level_square = b[0] ** 2 + b[1] ** 2
+    if level_square < WEAKEST_LEVEL**2:
+        return 0
+    expected = 0.5 * math.pi - state.field_declination
+    work.innovation[0] = wrapped(expected - predict(state, payload, settings))
+    # Not at the measured direction: its noise, which is in the innovation too, would drag along tilt and hard iron.
+    angle = expected + state.optional[settings.mag_error_at - ERROR_SIZE]
+    level = math.sqrt(level_square)
+    east, north, slope = math.cos(angle), math.sin(angle), -b[2] / level
+    if state.field_strength > 0.0:
+        level = state.field_strength * math.cos(state.field_inclination)
+        slope = math.tan(state.field_inclination)
+    set_attitude_row(work.jacobian, 0, state, local_to_ecef, (slope * east, slope * north, 1.0))
+    work.jacobian[0, settings.mag_error_at] = -1.0
+
+    # How the angle changes with the reading: first in local axes, then in map, body, and the axes of the sensor.
+    change = (-north / level, east / level, 0.0)
+    change = rotate_back(state.map_to_ecef, rotate(local_to_ecef, change))
+    change = rotate_back(settings.mag_to_imu, rotate_back(to_matrix(state.attitude), change))
+    xx, xy, xz, yy, yz, zz = payload[3], payload[4], payload[5], payload[6], payload[7], payload[8]
+    spread = rotate(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)), change)
+    work.noise[0, 0] = dot(change, spread)
+    if settings.magnetic_bias_at < state.error_size:
+        for i in range(3):
+            work.jacobian[0, settings.magnetic_bias_at + i] = -change[i]
+    return 1
+
+
+@njit
+def update_disturbance(state, aid, settings):
+    """Say whether strength or inclination of the field are, or were a moment ago, other than the Earth's here.
+
+    What they are is kept for the monitor.
+    """
+    if state.field_strength <= 0.0:
+        return False
+    b = to_local(state, local_east_north_up_to_ecef(state), earth_field_body(state, aid.payload, settings))
+    strength = math.sqrt(dot(b, b))
+    inclination = math.atan2(-b[2], math.hypot(b[0], b[1]))
+    state.field_found[0] = strength
+    state.field_found[1] = inclination
+    doubt = 0.0
+    place = settings.magnetic_bias_at
+    if place < state.error_size:
+        for i in range(3):
+            doubt = max(doubt, state.covariance[place + i, place + i])
+    doubt = SIGMAS * math.sqrt(doubt) / state.field_strength
+    if (
+        abs(strength / state.field_strength - 1.0) > settings.mag_strength_tolerance + doubt
+        or abs(inclination - state.field_inclination) > settings.mag_inclination_tolerance + doubt
+    ):
+        state.disturbed_stamp = aid.stamp
+    return aid.stamp - state.disturbed_stamp < HOLD
+
+
+@njit
+def propagate_mag_error(state, heading, settings):
+    """Let the error of the field change with what was turned and travelled.
+
+    ``heading`` (rad). The error fades by exp(-way) and is driven so that its variance stays as it was at first (Gelb,
+    Applied Optimal Estimation, section 3.8, with the way in place of the time). In steps, so that a parked robot, whose
+    estimate trembles, makes no way.
+    """
+    i = settings.mag_error_at
+    p, last = state.position_map, state.mag_position
+    distance = math.sqrt((p[0] - last[0]) ** 2 + (p[1] - last[1]) ** 2 + (p[2] - last[2]) ** 2)
+    way = distance / settings.mag_error_distance + abs(wrapped(heading - state.mag_heading)) / TURN
+    if way < STEP:
+        return
+    fading = math.exp(-way)
+    state.optional[i - ERROR_SIZE] *= fading
+    covariance = state.covariance
+    for j in range(state.error_size):
+        covariance[i, j] *= fading
+        covariance[j, i] *= fading
+    covariance[i, i] += (1.0 - fading**2) * settings.optional_std[i - ERROR_SIZE] ** 2
+    state.mag_heading = heading
+    for k in range(3):
+        state.mag_position[k] = p[k]
+
+
+@njit
+def note_field(state, aid, place):
+    """Remember the Earth's field at a good fix or range, which carries it from ``place`` of its payload on."""
+    if aid.verdict == Verdict.FUSED and aid.payload[place] > 0.0:
+        state.field_declination = aid.payload[place + 1]
+        state.field_inclination = aid.payload[place + 2]
+        state.field_strength = aid.payload[place + 3]
+        state.field_known = 1

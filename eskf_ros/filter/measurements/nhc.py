@@ -1,0 +1,95 @@
+"""Non-holonomic constraint: a vehicle on wheels moves neither sideways nor up and down where it does not steer.
+
+Lateral and vertical velocity of the point ``nhc.position`` (the rear axle) in the axes of the vehicle are zero:
+left . (R' v + omega x arm) = 0, and the same with up (Dissanayake et al., The aiding of a low-cost strapdown inertial
+measurement unit using vehicle model constraints, 2001). No payload; the timeline puts it on its grid.
+
+How far that is from true: tyres slip sideways by an angle that grows with the acceleration, springs let the body pitch
+and roll with it, and even straight ahead the direction of travel differs a little from the vehicle's axes (side wind,
+camber). So the noise has a constant part and an angle times the speed, and the angle grows with the acceleration. These
+errors last for seconds, longer than the grid is wide. The default angles are therefore about twice what cars show:
+an error that lasts for 2 s and comes with every one of the constraints does as much harm as one of twice the size that
+is new every second.
+"""
+
+from __future__ import annotations
+
+import math
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.inertial.navigation_frame import body_rate
+from eskf_ros.filter.measurements.jacobians import (
+    clear,
+    gyro_noise_variance,
+    horizontal_acceleration,
+    mounting_of,
+    point_velocity,
+    set_mounting,
+    set_point_velocity_row,
+    vehicle_axes,
+)
+from eskf_ros.filter.state.layout import ATTITUDE
+from eskf_ros.filter.state.time import NEVER
+from eskf_ros.filter.stationarity.detector import has_block, mean_force
+from eskf_ros.geodesy.rotation import cross, dot, to_matrix
+
+SIZE = 2
+
+CERTAIN_HEADING = 0.17
+"""With a heading less certain than this (rad) the direction of travel says nothing yet."""
+
+SLIP_MEMORY = 1_500_000_000
+SLIPPING = 5.0
+"""For so long (ns) after a message of the wheels outside the gate all deviations are taken so much larger."""
+
+
+@njit
+def predict(state, settings):
+    """Return the lateral and the vertical velocity (m/s) of the point."""
+    rotation = to_matrix(state.attitude)
+    _forward, left, up = vehicle_axes(state, settings)
+    velocity = point_velocity(state, rotation, body_rate(state, rotation), settings.nhc_arm_body)
+    return dot(left, velocity), dot(up, velocity)
+
+
+@njit
+def heading_variance(state):
+    """Return the variance (rad2) of the heading."""
+    return state.covariance[ATTITUDE + 2, ATTITUDE + 2]
+
+
+@njit
+def linearize(state, settings, work):
+    """Write innovation, Jacobian and noise to ``work``; return the number of scalars, 0 when it does not hold."""
+    if not has_block(state) or heading_variance(state) > CERTAIN_HEADING**2:
+        return 0
+    clear(work)
+    rotation = to_matrix(state.attitude)
+    arm = settings.nhc_arm_body
+    forward, left, up = vehicle_axes(state, settings)
+    speed = dot(forward, point_velocity(state, rotation, body_rate(state, rotation), arm))
+    sideways, upwards = predict(state, settings)
+    _yaw, pitch = mounting_of(state, settings)
+    cosine, sine = math.cos(pitch), math.sin(pitch)
+
+    work.innovation[0] = -sideways
+    work.innovation[1] = -upwards
+    set_point_velocity_row(work.jacobian, 0, left, 1.0, state, rotation, arm)
+    set_point_velocity_row(work.jacobian, 1, up, 1.0, state, rotation, arm)
+    set_mounting(work.jacobian, 0, -cosine * speed - sine * upwards, 0.0, state, settings)
+    set_mounting(work.jacobian, 1, sine * sideways, speed, state, settings)
+
+    slip = settings.nhc_slip * horizontal_acceleration(state, rotation, mean_force(state))
+    angle_variance = settings.nhc_angle_std**2 + slip**2
+    loosening = 1.0
+    if state.slip_stamp != NEVER and state.stamp - state.slip_stamp <= SLIP_MEMORY:
+        loosening = SLIPPING**2
+    rate_variance = gyro_noise_variance(state, settings)
+    left_lever, up_lever = cross(left, arm), cross(up, arm)
+    work.noise[0, 0] = loosening * (settings.nhc_lateral_std**2 + angle_variance * speed**2)
+    work.noise[1, 1] = loosening * (settings.nhc_vertical_std**2 + angle_variance * speed**2)
+    work.noise[0, 0] += rate_variance * dot(left_lever, left_lever)
+    work.noise[1, 1] += rate_variance * dot(up_lever, up_lever)
+    work.noise[0, 1] = rate_variance * dot(left_lever, up_lever)
+    work.noise[1, 0] = work.noise[0, 1]
+    return SIZE

@@ -1,0 +1,123 @@
+"""Wheel odometry: forward speed of a point of the vehicle, and its yaw rate.
+
+Payload: speed (m/s), yaw rate (rad/s), 0, covariance (ss, sy, 0, yy, 0, absent); what is not measured has the variance
+-1. The speed is that of the point ``wheel.position`` along the x axis of the vehicle, forward . (R' v + omega x arm),
+times one plus the scale error; the yaw rate is that about the vehicle's z axis (Groves, section 16.1.1, with attitude,
+gyro bias, scale and mounting in the Jacobian).
+
+The covariance of the message is that of the noise of each message alone. What lasts is added here: tyres slip by a
+share of the speed that grows with the force on them, and wheels of unequal size turn a straight line into a curve. An
+error that lasts for T s and comes with every message, dt s apart, does as much harm as a new one every time with
+2 T / dt times the variance (the spectral densities of the two at low frequencies are equal).
+"""
+
+from __future__ import annotations
+
+import math
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.inertial.navigation_frame import body_rate
+from eskf_ros.filter.measurements.jacobians import (
+    clear,
+    gyro_noise_variance,
+    horizontal_acceleration,
+    mounting_of,
+    point_velocity,
+    set_mounting,
+    set_point_velocity_row,
+    vehicle_axes,
+)
+from eskf_ros.filter.state.layout import ATTITUDE, ERROR_SIZE, GYRO_BIAS
+from eskf_ros.filter.state.time import NEVER
+from eskf_ros.geodesy.rotation import cross, dot, rotate, to_matrix
+
+LASTING_SPEED_ERROR = 0.001
+"""Share of the speed by which it is wrong for a while, even when no force is on the tyres."""
+
+SLIP_TIME = 1.0
+"""Seconds for which slip lasts."""
+
+LASTING_TURN_ERROR = 0.03
+"""Share of the yaw rate by which it is wrong: the track of tyres that are squeezed and slip."""
+
+UNEQUAL_WHEELS = 7e-4
+"""Yaw rate (rad/s) that wheels of unequal size pretend at 1 m/s: 0.1 % of their radius, 1.5 m apart."""
+
+TURN_ERROR_TIME = 60.0
+"""Seconds for which errors of the yaw rate last: load and tyre pressure."""
+
+SHORTEST_INTERVAL = 0.001
+
+
+@njit
+def scale_of(state, settings):
+    """Return what the wheels multiply the speed with."""
+    place = settings.wheel_scale_at
+    if place >= state.error_size:
+        return 1.0
+    return 1.0 + state.optional[place - ERROR_SIZE]
+
+
+@njit
+def predict(state, settings):
+    """Return the speed (m/s) and the yaw rate (rad/s) that the wheels should show."""
+    rotation = to_matrix(state.attitude)
+    rate = body_rate(state, rotation)
+    forward, _left, up = vehicle_axes(state, settings)
+    velocity = point_velocity(state, rotation, rate, settings.wheel_arm_body)
+    return scale_of(state, settings) * dot(forward, velocity), dot(up, rate)
+
+
+@njit
+def repeated(state, time):
+    """Return the factor on the variance of an error that lasts for ``time`` s and comes with every message."""
+    if state.wheel_stamp == NEVER:
+        return 1.0
+    interval = max((state.stamp - state.wheel_stamp) * 1e-9, SHORTEST_INTERVAL)
+    return max(1.0, 2.0 * time / interval)
+
+
+@njit
+def linearize(state, payload, settings, work):
+    """Write innovation, Jacobian and noise of one message to ``work``; return the number of scalars."""
+    clear(work)
+    rotation = to_matrix(state.attitude)
+    rate = body_rate(state, rotation)
+    arm = settings.wheel_arm_body
+    forward, left, up = vehicle_axes(state, settings)
+    velocity = point_velocity(state, rotation, rate, arm)
+    speed, scale = dot(forward, velocity), scale_of(state, settings)
+    predicted_speed, turn_rate = predict(state, settings)
+    _yaw, pitch = mounting_of(state, settings)
+    cosine, sine = math.cos(pitch), math.sin(pitch)
+    rate_variance = gyro_noise_variance(state, settings)
+    lever = cross(forward, arm)
+
+    size = 0
+    if payload[3] >= 0.0:
+        work.innovation[0] = payload[0] - predicted_speed
+        set_point_velocity_row(work.jacobian, 0, forward, scale, state, rotation, arm)
+        sideways, upwards = dot(left, velocity), dot(up, velocity)
+        set_mounting(work.jacobian, 0, scale * cosine * sideways, -scale * upwards, state, settings)
+        if settings.wheel_scale_at < state.error_size:
+            work.jacobian[0, settings.wheel_scale_at] = speed
+        acceleration = horizontal_acceleration(state, rotation, state.specific_force)
+        slip = speed * (LASTING_SPEED_ERROR + settings.wheel_slip * acceleration)
+        work.noise[0, 0] = payload[3] + repeated(state, SLIP_TIME) * slip**2 + rate_variance * dot(lever, lever)
+        size = 1
+    if payload[6] >= 0.0:
+        work.innovation[size] = payload[1] - turn_rate
+        earth = cross(rotate(rotation, up), state.earth_rate_map)
+        for j in range(3):
+            work.jacobian[size, ATTITUDE + j] = -earth[j]
+            work.jacobian[size, GYRO_BIAS + j] = -up[j]
+        set_mounting(work.jacobian, size, sine * dot(left, rate), dot(forward, rate), state, settings)
+        lasting = (LASTING_TURN_ERROR * turn_rate) ** 2 + (UNEQUAL_WHEELS * speed) ** 2
+        work.noise[size, size] = payload[6] + repeated(state, TURN_ERROR_TIME) * lasting + rate_variance
+        if size == 1:
+            # The noise of the gyro is in both predictions.
+            shared = payload[4] - scale * rate_variance * dot(lever, up)
+            work.noise[0, 1] = shared
+            work.noise[1, 0] = shared
+        size += 1
+    return size

@@ -1,0 +1,69 @@
+"""Zero angular rate update: a robot that stands still turns with the Earth, and the rest that its gyro reads is bias.
+
+mean rate = gyro bias + R' Omega + noise, over the time since the last point on the grid of the constraints (Groves,
+section 15.3.2, with the Earth rate and, in the Jacobian, what an attitude error makes of it: a heading that is not
+known leaves the horizontal part of the Earth rate in doubt, and one that is can be sharpened by it).
+
+The white noise in the mean is the very noise that has turned the attitude since the last grid point: they are
+correlated, and the update is told so (``work.shared``). Taking the one back takes the other back: the heading stands as
+still as the robot, instead of walking with the noise of the gyro.
+"""
+
+from __future__ import annotations
+
+import math
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.measurements.jacobians import clear, set_identity
+from eskf_ros.filter.state.layout import ATTITUDE, CONSTRAINT_INTERVAL, GYRO_BIAS
+from eskf_ros.filter.stationarity.detector import is_resting, mean_rate
+from eskf_ros.geodesy.rotation import cross, rotate_back, to_matrix
+
+SIZE = 3
+
+INTERVAL = CONSTRAINT_INTERVAL * 1e-9
+
+
+@njit
+def predict(state):
+    """Return what the gyro reads (rad/s, IMU axes) when the robot stands still."""
+    earth = rotate_back(to_matrix(state.attitude), state.earth_rate_map)
+    bias = state.gyro_bias
+    return (bias[0] + earth[0], bias[1] + earth[1], bias[2] + earth[2])
+
+
+@njit
+def remaining_share(state, density):
+    """Return how much of the noise of the last interval is certainly still in the attitude (0 to 1).
+
+    Measurements in between may have taken it back. Never so much that attitude and noise have no common covariance.
+    """
+    smallest = min(
+        state.covariance[ATTITUDE, ATTITUDE],
+        state.covariance[ATTITUDE + 1, ATTITUDE + 1],
+        state.covariance[ATTITUDE + 2, ATTITUDE + 2],
+    )
+    return min(1.0, math.sqrt(0.5 * smallest / (density**2 * INTERVAL)))
+
+
+@njit
+def linearize(state, settings, work):
+    """Write innovation, Jacobian and noise to ``work``; return the number of scalars, 0 when it does not hold."""
+    if not is_resting(state, settings):
+        return 0
+    clear(work)
+    measured, predicted = mean_rate(state), predict(state)
+    rotation = to_matrix(state.attitude)
+    density = settings.gyro_noise_density
+    shared = density**2 * remaining_share(state, density)
+    set_identity(work.jacobian, GYRO_BIAS)
+    for i in range(SIZE):
+        work.innovation[i] = measured[i] - predicted[i]
+        work.noise[i, i] = density**2 / INTERVAL + settings.zupt_rate_std**2
+        axis = (rotation[0][i], rotation[1][i], rotation[2][i])
+        earth = cross(axis, state.earth_rate_map)
+        for j in range(3):
+            work.jacobian[i, ATTITUDE + j] = earth[j]
+            # The attitude has turned by R times the noise, and lags by it: the covariance of noise i and error j.
+            work.shared[i, ATTITUDE + j] = -axis[j] * shared
+    return SIZE

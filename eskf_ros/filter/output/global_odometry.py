@@ -1,0 +1,194 @@
+"""What is published: the state of the IMU turned into pose and twist of base_link, with covariance."""
+
+from __future__ import annotations
+
+import math
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.alignment.levelling import UNKNOWN_SPEED
+from eskf_ros.filter.inertial.navigation_frame import body_rate, heading_of
+from eskf_ros.filter.state.layout import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, VELOCITY, Status
+from eskf_ros.filter.state.time import NEVER
+from eskf_ros.geodesy.rotation import cross, from_matrix, from_rotation_vector, multiply, rotate, rotate_back, to_matrix
+
+SHORTEST_COAST = 1_000_000_000
+LONGEST_WAIT = 3_000_000_000
+
+CONTRADICTIONS = 3
+"""So many fixes in a row that were not fused as they came are more than outliers."""
+
+
+@njit
+def status_of(state, settings):
+    """Return the rung of the ladder; coasting is a second without a fix, or twice the usual wait up to three."""
+    if state.imu_stamp == NEVER:
+        return Status.WAITING_IMU
+    if state.level_known == 0:
+        return Status.LEVELLING
+    if not is_sound(state):
+        return Status.FAULT
+    if state.position_known == 0:
+        return Status.WAITING_FIX
+    if state.heading_known == 0:
+        return Status.WAITING_HEADING
+    patience = max(SHORTEST_COAST, min(LONGEST_WAIT, 2 * state.absolute_interval))
+    if state.stamp - state.absolute_stamp > patience:
+        return Status.COASTING
+    if state.rejected_fixes >= CONTRADICTIONS:
+        return Status.DEGRADED
+    if state.covariance[ATTITUDE + 2, ATTITUDE + 2] > settings.good_heading_std**2:
+        return Status.ALIGNING
+    return Status.GOOD
+
+
+@njit
+def is_sound(state):
+    """Say whether position, velocity, attitude and all variances are numbers, and no variance is negative."""
+    total = state.attitude[0] + state.attitude[1] + state.attitude[2] + state.attitude[3]
+    for i in range(3):
+        total += state.position_map[i] + state.velocity_map[i]
+    for i in range(ERROR_SIZE):
+        if not state.covariance[i, i] >= 0.0:
+            return False
+        total += state.covariance[i, i]
+    return math.isfinite(total)
+
+
+@njit
+def attitude_base_to_map(state, settings):
+    """Return the rotation from base_link to map as row tuples."""
+    imu = to_matrix(state.attitude)
+    m = settings.imu_to_base
+    row = (m[0, 0], m[0, 1], m[0, 2])
+    first = rotate(imu, row)
+    row = (m[1, 0], m[1, 1], m[1, 2])
+    second = rotate(imu, row)
+    row = (m[2, 0], m[2, 1], m[2, 2])
+    third = rotate(imu, row)
+    return (
+        (first[0], second[0], third[0]),
+        (first[1], second[1], third[1]),
+        (first[2], second[2], third[2]),
+    )
+
+
+@njit
+def write_odometry(state, local, settings, row):
+    """Fill one ODOMETRY row from the state and the local pose.
+
+    The pose error of base_link is that of the IMU plus [R m]x theta, m the IMU's place in base_link; the twist error
+    in base_link axes is R' (dv + v x theta), v the velocity of the IMU (first order; Sola, section 4.4).
+    """
+    covariance = state.covariance
+    base_to_map = attitude_base_to_map(state, settings)
+    imu_offset = rotate(base_to_map, settings.imu_position_base)
+    rate_imu = body_rate(state, to_matrix(state.attitude))
+    rate_base = rotate(settings.imu_to_base, rate_imu)
+    sway = rotate(base_to_map, cross(rate_base, settings.imu_position_base))
+    velocity = (state.velocity_map[0] - sway[0], state.velocity_map[1] - sway[1], state.velocity_map[2] - sway[2])
+    velocity_base = rotate_back(base_to_map, velocity)
+    attitude = from_matrix(base_to_map)
+
+    row.stamp = state.stamp
+    row.status = status_of(state, settings)
+    row.position_known = state.position_known == 1
+    row.heading_known = state.heading_known == 1
+    for i in range(4):
+        row.attitude_body_to_map[i] = attitude[i]
+    for i in range(3):
+        row.position_map[i] = state.position_map[i] - imu_offset[i]
+        row.velocity_map[i] = velocity[i]
+        row.velocity_body[i] = velocity_base[i]
+        row.angular_rate_body[i] = rate_base[i]
+        row.accel_bias[i] = state.accel_bias[i]
+        row.gyro_bias[i] = state.gyro_bias[i]
+        row.accel_bias_std[i] = math.sqrt(max(covariance[ACCEL_BIAS + i, ACCEL_BIAS + i], 0.0))
+        row.gyro_bias_std[i] = math.sqrt(max(covariance[GYRO_BIAS + i, GYRO_BIAS + i], 0.0))
+    write_local_pose(state, local, attitude, settings, row)
+    write_pose_covariance(covariance, imu_offset, row)
+    write_twist_covariance(state, base_to_map, settings, row)
+
+
+@njit
+def write_local_pose(state, local, attitude, settings, row):
+    """Write the pose of base_link in odom; ``attitude`` is the quaternion from base_link to map."""
+    turn = from_rotation_vector((0.0, 0.0, local.heading - heading_of(state, settings)))
+    attitude_odom = multiply(turn, attitude)
+    imu_offset = rotate(to_matrix(attitude_odom), settings.imu_position_base)
+    for i in range(4):
+        row.attitude_body_to_odom[i] = attitude_odom[i]
+    for i in range(3):
+        row.position_odom[i] = local.position[i] - imu_offset[i]
+    row.local_position_variance = local.position_variance
+    row.local_heading_variance = local.heading_variance
+
+
+@njit
+def cross_row(v, i):
+    """Return row ``i`` of the matrix [v]x."""
+    if i == 0:
+        return (0.0, -v[2], v[1])
+    if i == 1:
+        return (v[2], 0.0, -v[0])
+    return (-v[1], v[0], 0.0)
+
+
+@njit
+def write_pose_covariance(covariance, imu_offset, row):
+    """Write the 6x6 covariance of position and attitude of base_link (map axes)."""
+    for i in range(3):
+        a = cross_row(imu_offset, i)
+        for j in range(3):
+            b = cross_row(imu_offset, j)
+            position = covariance[POSITION + i, POSITION + j]
+            mixed = covariance[POSITION + i, ATTITUDE + j]
+            for k in range(3):
+                position += a[k] * covariance[ATTITUDE + k, POSITION + j]
+                position += covariance[POSITION + i, ATTITUDE + k] * b[k]
+                mixed += a[k] * covariance[ATTITUDE + k, ATTITUDE + j]
+                for n in range(3):
+                    position += a[k] * covariance[ATTITUDE + k, ATTITUDE + n] * b[n]
+            row.pose_covariance[i, j] = position
+            row.pose_covariance[i, 3 + j] = mixed
+            row.pose_covariance[3 + j, i] = mixed
+            row.pose_covariance[3 + i, 3 + j] = covariance[ATTITUDE + i, ATTITUDE + j]
+    for i in range(3):
+        for j in range(i):
+            row.pose_covariance[i, j] = row.pose_covariance[j, i]
+
+
+@njit
+def write_twist_covariance(state, base_to_map, settings, row):
+    """Write the 6x6 covariance of the twist in base_link axes."""
+    covariance = state.covariance
+    # The sway of the mounting offset is known in body axes: an attitude error turns only the velocity of the IMU.
+    velocity = (state.velocity_map[0], state.velocity_map[1], state.velocity_map[2])
+    # What the rate error times the mounting offset adds to the velocity is left out: millimetres per second.
+    rate_variance = settings.gyro_noise_density**2 / state.imu_interval
+    for i in range(3):
+        forward_i = (base_to_map[0][i], base_to_map[1][i], base_to_map[2][i])
+        lever_i = cross(forward_i, velocity)
+        for j in range(i + 1):
+            forward_j = (base_to_map[0][j], base_to_map[1][j], base_to_map[2][j])
+            lever_j = cross(forward_j, velocity)
+            linear = 0.0
+            angular = 0.0
+            for k in range(3):
+                for n in range(3):
+                    linear += forward_i[k] * covariance[VELOCITY + k, VELOCITY + n] * forward_j[n]
+                    linear += lever_i[k] * covariance[ATTITUDE + k, ATTITUDE + n] * lever_j[n]
+                    linear += forward_i[k] * covariance[VELOCITY + k, ATTITUDE + n] * lever_j[n]
+                    linear += lever_i[k] * covariance[ATTITUDE + k, VELOCITY + n] * forward_j[n]
+                    angular += (
+                        settings.imu_to_base[i, k]
+                        * covariance[GYRO_BIAS + k, GYRO_BIAS + n]
+                        * settings.imu_to_base[j, n]
+                    )
+            if i == j:
+                angular += rate_variance
+                if state.position_known == 0:
+                    linear += UNKNOWN_SPEED**2
+            row.twist_covariance[i, j] = linear
+            row.twist_covariance[j, i] = linear
+            row.twist_covariance[3 + i, 3 + j] = angular
+            row.twist_covariance[3 + j, 3 + i] = angular

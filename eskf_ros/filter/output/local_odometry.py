@@ -1,0 +1,77 @@
+"""Odometry without jumps: the pose of base_link in `odom`, moved only by what the IMU and the velocity say.
+
+Corrections move the map pose; here they are taken out again. From one IMU sample to the next the local pose gains the
+predicted displacement and turn, without the jumps of the measurements in between and without those of a rewind: the
+step is that of the latest estimate, the place it starts from is what was published. Roll and pitch are the filter's.
+It depends on the order of arrival, as only the complaints about messages that were not let in do besides, and it is not
+part of the rewound state.
+"""
+
+from __future__ import annotations
+
+import math
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.alignment.levelling import UNKNOWN_SPEED
+from eskf_ros.filter.inertial.navigation_frame import heading_of
+from eskf_ros.filter.state.layout import GYRO_BIAS, VELOCITY
+from eskf_ros.filter.state.time import NEVER
+from eskf_ros.geodesy.rotation import wrapped
+
+STILL_SPEED = 0.05
+"""Speed (m/s) that a robot at rest may have without anybody noticing."""
+
+
+@njit
+def measure_step(state, settings):
+    """Note displacement (m, map) and turn (rad) since the last IMU sample, corrections left out."""
+    heading = heading_of(state, settings)
+    for i in range(3):
+        state.step_position[i] = state.position_map[i] - state.sample_position[i] - state.jump_position[i]
+        state.sample_position[i] = state.position_map[i]
+        state.jump_position[i] = 0.0
+    state.step_heading = wrapped(heading - state.sample_heading - state.jump_heading)
+    state.sample_heading = heading
+    state.jump_heading = 0.0
+
+
+@njit
+def note_jump(state, position, heading, settings):
+    """Add how far a correction has moved the state from ``position`` (m) and ``heading`` (rad)."""
+    for i in range(3):
+        state.jump_position[i] += state.position_map[i] - position[i]
+        state.corrections_map[i] += state.position_map[i] - position[i]
+    state.jump_heading += wrapped(heading_of(state, settings) - heading)
+
+
+@njit
+def carry(local, state, settings):
+    """Move the local pose by the step of the newest IMU sample, and let its uncertainty grow.
+
+    Velocity and gyro bias errors last, so they add up linearly; the position also goes astray by the heading's.
+    """
+    if local.started == 0:
+        local.started = 1
+        return
+    local.heading += state.step_heading
+    c = math.cos(local.heading - state.sample_heading)
+    s = math.sin(local.heading - state.sample_heading)
+    x, y, z = state.step_position[0], state.step_position[1], state.step_position[2]
+    local.position[0] += c * x - s * y
+    local.position[1] += s * x + c * y
+    local.position[2] += z
+
+    dt = state.imu_interval
+    covariance = state.covariance
+    bias_variance = 0.0
+    velocity_variance = 0.0
+    for i in range(3):
+        bias_variance = max(bias_variance, covariance[GYRO_BIAS + i, GYRO_BIAS + i])
+        velocity_variance = max(velocity_variance, covariance[VELOCITY + i, VELOCITY + i])
+    if state.position_known == 0:
+        at_rest = state.still_stamp != NEVER and state.stamp - state.still_stamp < 1.5e9 * settings.static_duration
+        velocity_variance = STILL_SPEED**2 if at_rest else UNKNOWN_SPEED**2
+    heading_std = math.sqrt(local.heading_variance) + math.sqrt(bias_variance) * dt
+    local.heading_variance = heading_std**2 + settings.gyro_noise_density**2 * dt
+    drift = math.sqrt(velocity_variance) * dt + math.sqrt(x * x + y * y) * heading_std
+    local.position_variance = (math.sqrt(local.position_variance) + drift) ** 2

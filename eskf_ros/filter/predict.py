@@ -1,0 +1,102 @@
+"""The prediction: state, covariance and the search for the heading from one measurement or IMU sample to the next."""
+
+from __future__ import annotations
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.alignment.heading_search import predict_search
+from eskf_ros.filter.inertial.covariance import add_noise, propagate_covariance
+from eskf_ros.filter.inertial.strapdown import propagate_nominal_state
+from eskf_ros.filter.state import augmented_states
+from eskf_ros.filter.state.layout import ERROR_SIZE
+from eskf_ros.filter.state.time import SECOND
+from eskf_ros.geodesy.rotation import dot
+
+LONGEST_STEP = 20_000_000
+"""A longer IMU interval is integrated in equal steps of at most this many ns."""
+
+WANDER_ACCELERATION = 0.5
+
+WANDER_TIME = 1.0
+"""Unknown heading: the robot may accelerate by this much (m/s2) more than measured, for about this long (s)."""
+
+
+@njit
+def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
+    """Advance nominal state and covariance by ``dt`` s between two raw IMU readings (m/s2, rad/s; IMU axes).
+
+    ``gap`` (s) is the length of the hole in the IMU data that is being bridged, 0 for none.
+    """
+    # With an unknown heading the direction of the measured acceleration is unknown: position and velocity live on GNSS.
+    coupling = 0.0 if state.heading_known == 0 else 1.0
+    middle, force, gravity = propagate_nominal_state(state, force_0, rate_0, force_1, rate_1, dt, coupling)
+    # Motion hidden by a gap is constant over it: as a density it has the same variance at the end.
+    velocity_noise = settings.accel_noise_density**2 + settings.gap_accel_std**2 * gap
+    attitude_noise = settings.gyro_noise_density**2 + settings.gap_gyro_std**2 * gap
+    if state.heading_known == 0:
+        acceleration = (force[0] + gravity[0], force[1] + gravity[1], force[2] + gravity[2])
+        predict_search(state, acceleration, middle, dt, settings)
+        velocity_noise += WANDER_TIME * (WANDER_ACCELERATION**2 + dot(acceleration, acceleration))
+    size = state.error_size
+    propagate_covariance(state.covariance, size, middle, force, gravity, state.earth_rate_map, dt, coupling, work)
+    add_noise(state.covariance, velocity_noise, attitude_noise, dt, settings)
+    if size > ERROR_SIZE:
+        augmented_states.propagate_augmented(state, dt, settings)
+
+
+@njit
+def propagate(state, stamp, sample, settings, work):
+    """Advance the state to ``stamp`` (ns), at or before ``sample``, the IMU sample that comes next.
+
+    Between two samples the IMU is the straight line whose mean is that of the parabola through them and the sample
+    before (Adams-Moulton): cut anywhere, the parts give the whole. A long interval is integrated in steps; one longer
+    than the gap of the settings may hide motion and costs extra uncertainty.
+    """
+    interval = (sample.stamp - state.imu_stamp) / SECOND
+    force_0, force_1 = line(state.earlier_force, state.imu_force, sample.specific_force, interval, state, settings)
+    rate_0, rate_1 = line(state.earlier_rate, state.imu_rate, sample.angular_rate, interval, state, settings)
+    gap = interval if interval > settings.imu_gap else 0.0
+    steps = (stamp - state.stamp + LONGEST_STEP - 1) // LONGEST_STEP
+    begin = (state.stamp - state.imu_stamp) / SECOND / interval
+    end = (stamp - state.imu_stamp) / SECOND / interval
+    force_a = between(force_0, force_1, begin)
+    rate_a = between(rate_0, rate_1, begin)
+    for k in range(steps):
+        fraction = begin + (end - begin) * (k + 1) / steps
+        force_b = between(force_0, force_1, fraction)
+        rate_b = between(rate_0, rate_1, fraction)
+        step(state, force_a, rate_a, force_b, rate_b, (end - begin) * interval / steps, gap, settings, work)
+        force_a = force_b
+        rate_a = rate_b
+    force = between(state.imu_force, sample.specific_force, end)
+    rate = between(state.imu_rate, sample.angular_rate, end)
+    for i in range(3):
+        state.specific_force[i] = force[i]
+        state.angular_rate[i] = rate[i]
+    state.stamp = stamp
+
+
+@njit
+def line(earlier, last, following, interval, state, settings):
+    """Return the ends of the straight line that stands for the IMU between two samples (see ``propagate``)."""
+    bend = 0.0
+    if interval <= settings.imu_gap and 0.0 < state.imu_interval <= settings.imu_gap:
+        bend = interval * interval / (6.0 * (interval + state.imu_interval))
+    shift = (
+        bend * ((following[0] - last[0]) / interval - (last[0] - earlier[0]) / state.imu_interval),
+        bend * ((following[1] - last[1]) / interval - (last[1] - earlier[1]) / state.imu_interval),
+        bend * ((following[2] - last[2]) / interval - (last[2] - earlier[2]) / state.imu_interval),
+    )
+    return (
+        (last[0] - shift[0], last[1] - shift[1], last[2] - shift[2]),
+        (following[0] - shift[0], following[1] - shift[1], following[2] - shift[2]),
+    )
+
+
+@njit
+def between(a, b, fraction):
+    """Return the 3-vector at ``fraction`` of the way from ``a`` to ``b``."""
+    return (
+        a[0] + fraction * (b[0] - a[0]),
+        a[1] + fraction * (b[1] - a[1]),
+        a[2] + fraction * (b[2] - a[2]),
+    )

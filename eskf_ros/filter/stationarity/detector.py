@@ -1,0 +1,286 @@
+"""Does the robot stand still? Readings of the IMU since the last point on the grid of the constraints, and evidence.
+
+At constant velocity an IMU reads what it reads at rest. That it is quiet is therefore necessary and not enough:
+
+- Sensors that see motion decide, if there are any: GNSS velocity, wheels, the velocity of the body, how far fixes have
+  moved since the IMU became quiet. Motion seen by any of them (air pressure that changes is motion, too) is a veto, and
+  rest seen by one of them is enough.
+- When none of them has said anything for a while (a tunnel), the readings have to be as quiet as they were when rest
+  was seen; and unless this robot was always much less quiet when motion was seen, the estimate itself has to say that
+  it stands. What remains undetectable without such sensors: slow motion at constant velocity, about a decimetre per
+  second, of a robot that moves as smoothly as it stands.
+
+How quiet is the variance of raw readings, so that no bias counts. Everything lives in the state and is rewound with it.
+"""
+
+from __future__ import annotations
+
+import math
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.state.layout import CONSTRAINT_INTERVAL, SOURCES, VELOCITY, Stream, Verdict
+from eskf_ros.filter.state.time import NEVER
+from eskf_ros.filter.stationarity.static_window import update_motion
+from eskf_ros.geodesy.earth import geodetic_to_ecef
+from eskf_ros.geodesy.rotation import dot
+
+FEWEST_SAMPLES = 3
+"""Of fewer samples in half an interval the spread says nothing."""
+
+STEADY_SIGMAS = 4.0
+"""At rest the means of the two halves differ by no more."""
+
+EVIDENCE_LASTS = 1_500_000_000
+"""What a sensor saw counts for so long (ns)."""
+
+MOTION_SIGMAS = 4.0
+LEAST_MOTION = 0.1
+"""A velocity proves motion that exceeds so many sigma, and this (m/s) ..."""
+
+REST_SIGMAS = 3.0
+WORST_REST_STD = 0.3
+"""... and speaks for rest below so many, if its sigma is no larger than this (m/s)."""
+
+DISPLACEMENT_SIGMAS = 5.0
+WORST_DISPLACEMENT_STD = 0.1
+"""The same for the displacement between two fixes, divided by the time between them."""
+
+WAY_LASTS = 3_000_000_000
+"""Before that displacement is measured over so long (ns)."""
+
+STANDING_SPEED = 0.01
+STANDING_YAW_RATE = 0.01
+"""Wheels stand below this (m/s, rad/s): they do not scatter around zero."""
+
+PRESSURE_LASTS = 30_000_000_000
+"""For so long (ns) the weather does not change the pressure by as much as a storey does."""
+
+AS_QUIET = 4.0
+"""Rest with twice the deviations of rest seen before is as quiet."""
+
+LEARNING = 0.1
+FORGETTING = 0.002
+"""How quickly the level of rest follows, and that of the quietest motion rises again, per grid interval."""
+
+LOUDEST = 2.0
+"""Rest that is louder counts as so many times the level learnt: it may be the moment before the wheels turn."""
+
+PLAINLY_LESS_QUIET = 9.0
+"""With three times the deviations motion cannot be taken for rest."""
+
+UNSEEN_SPEED = 0.3
+UNSEEN_SPEED_STD = 0.2
+"""Otherwise rest that no sensor sees needs an estimate that says so itself: speed and its sigma below these (m/s)."""
+
+
+@njit
+def add_to_block(state, settings):
+    """Add the newest IMU sample to the sums since the last grid point."""
+    end = -(-state.stamp // CONSTRAINT_INTERVAL) * CONSTRAINT_INTERVAL
+    if state.block_end != end:
+        learn_from_block(state, settings)
+        state.block_end = end
+        state.block_broken = 0
+        state.block_count = 0
+        state.block_half_count = 0
+        for i in range(6):
+            state.block_sum[i] = 0.0
+            state.block_square_sum[i] = 0.0
+    if state.imu_interval > settings.imu_gap:
+        state.block_broken = 1
+    if state.block_half_count == 0 and 2 * (end - state.stamp) < CONSTRAINT_INTERVAL:
+        state.block_half_count = state.block_count
+        for i in range(6):
+            state.block_half_sum[i] = state.block_sum[i]
+    state.block_count += 1
+    for i in range(3):
+        force, rate = state.specific_force[i], state.angular_rate[i]
+        state.block_sum[i] += force
+        state.block_square_sum[i] += force * force
+        state.block_sum[3 + i] += rate
+        state.block_square_sum[3 + i] += rate * rate
+
+
+@njit
+def is_complete(state):
+    """Say whether there are enough readings and no gap among them."""
+    count = state.block_half_count
+    return state.block_broken == 0 and count >= FEWEST_SAMPLES and state.block_count - count >= FEWEST_SAMPLES
+
+
+@njit
+def has_block(state):
+    """Say whether the state stands at a grid point and has the readings before it."""
+    return state.block_end == state.stamp and is_complete(state)
+
+
+@njit
+def mean_force(state):
+    """Return the mean specific force (m/s2, IMU axes, raw) since the last grid point."""
+    n, total = state.block_count, state.block_sum
+    return (total[0] / n, total[1] / n, total[2] / n)
+
+
+@njit
+def mean_rate(state):
+    """Return the mean angular rate (rad/s, IMU axes, raw) since the last grid point."""
+    n, total = state.block_count, state.block_sum
+    return (total[3] / n, total[4] / n, total[5] / n)
+
+
+@njit
+def unrest(state, settings):
+    """Return the sum of the variances of the readings over the largest that may still be rest; -1 if one exceeds it."""
+    total = 0.0
+    for i in range(6):
+        mean = state.block_sum[i] / state.block_count
+        variance = max(state.block_square_sum[i] / state.block_count - mean * mean, 0.0)
+        limit = settings.still_accel_std if i < 3 else settings.still_gyro_std
+        if variance > limit * limit:
+            return -1.0
+        total += variance / (limit * limit)
+    return total
+
+
+@njit
+def is_steady(state, settings):
+    """Say whether the means of both halves agree within noise and swaying: no push, no turn, no hand that holds it.
+
+    Vibration averages out, motion does not. Three velocities, at the ends and in the middle, make the difference of two
+    mean accelerations.
+    """
+    half = 0.5e-9 * CONSTRAINT_INTERVAL
+    sway = 6.0 * (settings.zupt_velocity_std / half) ** 2
+    first, second = state.block_half_count, state.block_count - state.block_half_count
+    for i in range(6):
+        change = (state.block_sum[i] - state.block_half_sum[i]) / second - state.block_half_sum[i] / first
+        if i < 3:
+            variance = 2.0 * settings.accel_noise_density**2 / half + sway
+        else:
+            variance = 2.0 * settings.gyro_noise_density**2 / half + 4.0 * settings.zupt_rate_std**2
+        if change * change > STEADY_SIGMAS**2 * variance:
+            return False
+    return True
+
+
+@njit
+def learn_from_block(state, settings):
+    """At the end of a block: how quiet are rest and motion that were seen? Where did the robot become quiet?"""
+    level = unrest(state, settings) if is_complete(state) and is_steady(state, settings) else -1.0
+    moved = state.moving_stamp > state.block_end - CONSTRAINT_INTERVAL
+    rested = state.resting_stamp > state.block_end - CONSTRAINT_INTERVAL
+    was_quiet = state.quiet
+    state.quiet = 1 if level >= 0.0 and not moved else 0
+    if state.quiet != was_quiet:
+        for source in range(SOURCES):
+            state.quiet_fix_stamp[source] = NEVER
+        state.quiet_pressure_stamp = NEVER
+    if level < 0.0:
+        return
+    if moved and (state.moving_level == 0.0 or level < state.moving_level):
+        state.moving_level = level
+    elif moved:
+        state.moving_level += FORGETTING * (level - state.moving_level)
+    elif rested and state.resting_level == 0.0:
+        state.resting_level = level
+    elif rested:
+        state.resting_level += LEARNING * (min(level, LOUDEST * state.resting_level) - state.resting_level)
+
+
+@njit
+def is_resting(state, settings):
+    """Say whether the robot has stood still since the last grid point, at which the state stands."""
+    if not (has_block(state) and is_steady(state, settings)):
+        return False
+    level = unrest(state, settings)
+    if level < 0.0 or state.stamp - state.moving_stamp <= EVIDENCE_LASTS:
+        return False
+    if state.stamp - state.resting_stamp <= EVIDENCE_LASTS:
+        return True
+    rest, motion = state.resting_level, state.moving_level
+    if rest == 0.0 or level > AS_QUIET * rest:
+        return False
+    if motion > PLAINLY_LESS_QUIET * rest and level < math.sqrt(rest * motion):
+        return True
+    variance = 0.0
+    for i in range(3):
+        variance = max(variance, state.covariance[VELOCITY + i, VELOCITY + i])
+    return dot(state.velocity_map, state.velocity_map) < UNSEEN_SPEED**2 and variance < UNSEEN_SPEED_STD**2
+
+
+@njit
+def update_rest_evidence(state, aid):
+    """Look at a measurement of any sensor for rest or motion, whatever the filter will make of it.
+
+    Returns whether it disproves the last level (`static_window.update_motion`).
+    """
+    p = aid.payload
+    if aid.stream == Stream.GNSS_POSITION:
+        note_displacement(state, aid)
+    elif aid.stream == Stream.GNSS_VELOCITY:
+        weigh_speed(
+            state, aid.stamp, math.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2), math.sqrt(max(p[3], p[6], p[8])), True
+        )
+    elif aid.stream == Stream.BODY_VELOCITY:
+        speed, std = math.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2), math.sqrt(max(p[3], p[6], p[8]))
+        weigh_speed(state, aid.stamp, speed, std, min(p[3], p[6], p[8]) > 0.0)
+        return update_motion(state, speed - REST_SIGMAS * std, aid.stamp, aid.stamp)
+    elif aid.stream == Stream.WHEEL:
+        if abs(p[0]) < STANDING_SPEED and abs(p[1]) < STANDING_YAW_RATE:
+            if p[3] > 0.0:
+                state.resting_stamp = aid.stamp
+        else:
+            state.moving_stamp = aid.stamp
+            return update_motion(state, abs(p[0]) - REST_SIGMAS * math.sqrt(max(p[3], 0.0)), aid.stamp, aid.stamp)
+    elif aid.stream == Stream.BARO:
+        note_pressure(state, aid)
+    return False
+
+
+@njit
+def weigh_speed(state, stamp, speed, std, is_whole):
+    """Take a speed (m/s) as evidence; only one that ``is_whole``, with all three axes, can speak for rest."""
+    if speed > max(MOTION_SIGMAS * std, LEAST_MOTION):
+        state.moving_stamp = stamp
+    elif is_whole and speed < REST_SIGMAS * std and std < WORST_REST_STD:
+        state.resting_stamp = stamp
+
+
+@njit
+def note_displacement(state, aid):
+    """Look how far a fix is from the one at which the IMU became quiet, or, until then, from one a few seconds old."""
+    fix = geodetic_to_ecef(aid.payload[0], aid.payload[1], aid.payload[2])
+    variance = max(aid.payload[3], aid.payload[6], aid.payload[8])
+    source = aid.source
+    age = aid.stamp - state.quiet_fix_stamp[source]
+    if state.quiet_fix_stamp[source] == NEVER or (state.quiet == 0 and age > WAY_LASTS):
+        state.quiet_fix_stamp[source] = aid.stamp
+        state.quiet_fix_variance[source] = variance
+        for i in range(3):
+            state.quiet_fix_ecef[source, i] = fix[i]
+        return
+    start = state.quiet_fix_ecef[source]
+    way = (fix[0] - start[0], fix[1] - start[1], fix[2] - start[2])
+    distance, std = math.sqrt(dot(way, way)), math.sqrt(variance + state.quiet_fix_variance[source])
+    if distance > DISPLACEMENT_SIGMAS * std:
+        state.moving_stamp = aid.stamp
+    elif state.quiet == 1 and distance < REST_SIGMAS * std and std < WORST_DISPLACEMENT_STD * age * 1e-9:
+        state.resting_stamp = aid.stamp
+
+
+@njit
+def note_pressure(state, aid):
+    """Look whether the air pressure (Pa) has changed since the IMU became quiet: up and down is motion, too."""
+    if state.quiet == 0 or aid.stamp - state.quiet_pressure_stamp > PRESSURE_LASTS:
+        state.quiet_pressure_stamp = aid.stamp
+        state.quiet_pressure = aid.payload[0]
+    elif abs(aid.payload[0] - state.quiet_pressure) > DISPLACEMENT_SIGMAS * math.sqrt(2.0 * aid.payload[3]):
+        state.moving_stamp = aid.stamp
+
+
+@njit
+def watch_wheels(state, aid):
+    """Note when the wheels spoke, and when the gate refused to believe them: they slip."""
+    state.wheel_stamp = aid.stamp
+    if aid.verdict == Verdict.GATE:
+        state.slip_stamp = aid.stamp

@@ -1,0 +1,109 @@
+"""Motion that passes for rest: a boat in waves, sensors held in the hand, a car that brakes evenly.
+
+Within a window whose readings are quiet enough for rest, the mean rate would be taken for the gyro bias and the mean
+force for gravity. White noise and the vibration of an engine average out within a part of the window. What the means of
+the parts still differ by is motion that lasts, and the mean of the window may be wrong by as much.
+"""
+
+from __future__ import annotations
+
+import math
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.state.layout import VELOCITY
+from eskf_ros.filter.state.time import NEVER
+from eskf_ros.geodesy.earth import EARTH_RATE
+from eskf_ros.geodesy.rotation import dot
+
+PART = 250_000_000
+"""Length of a part (ns)."""
+
+FEWEST_PARTS = 4
+
+MOVING_SPEED = 0.5
+"""What is faster (m/s) beyond its uncertainty moves."""
+
+REST_SIGMAS = 2.0
+"""A window is no rest while the filter has a velocity of this many sigma: better one too few than even braking."""
+
+MORE_THAN_NOISE = 5.0
+"""The variance of the means is above this many times that of white noise by accident in one of thousands of windows."""
+
+BIAS_SIGMAS = 4.0
+"""No gyro bias is further from what was expected."""
+
+
+@njit
+def add_to_part(state):
+    """Add the newest IMU sample to the part of the stillness window, whose beginning begins the parts anew."""
+    if state.window_start == NEVER:
+        state.moved_first = 1 if is_moving(state) else 0
+        state.part_start = state.stamp
+        state.part_count = 0
+        state.parts = 0
+        for i in range(6):
+            state.part_sum[i] = 0.0
+            state.part_mean_sum[i] = 0.0
+            state.part_square_sum[i] = 0.0
+    for i in range(3):
+        state.part_sum[i] += state.specific_force[i]
+        state.part_sum[3 + i] += state.angular_rate[i]
+    state.part_count += 1
+    if state.stamp - state.part_start < PART:
+        return
+    for i in range(6):
+        mean = state.part_sum[i] / state.part_count
+        state.part_mean_sum[i] += mean
+        state.part_square_sum[i] += mean * mean
+        state.part_sum[i] = 0.0
+    state.parts += 1
+    state.part_count = 0
+    state.part_start = state.stamp
+
+
+@njit
+def is_moving(state):
+    """Say whether the velocity that GNSS has given the filter is rather not that of a robot at rest."""
+    if state.position_known == 0:
+        return False
+    v = state.velocity_map
+    variance = 0.0
+    for i in range(3):
+        variance = max(variance, state.covariance[VELOCITY + i, VELOCITY + i])
+    return math.sqrt(dot(v, v)) - REST_SIGMAS * math.sqrt(variance) > MOVING_SPEED
+
+
+@njit
+def sway_variance(state, first, noise_density):
+    """Return the variance of the means of the parts if it is more than that of white noise; three axes from ``first``.
+
+    0: of the force ((m/s2)2), 3: of the rate ((rad/s)2). The largest of the axes counts.
+    """
+    n = state.parts
+    if n < FEWEST_PARTS:
+        return 0.0
+    white = noise_density**2 / (PART * 1e-9)
+    largest = 0.0
+    for i in range(first, first + 3):
+        mean = state.part_mean_sum[i] / n
+        largest = max(largest, (state.part_square_sum[i] / n - mean * mean) * n / (n - 1))
+    return largest if largest > MORE_THAN_NOISE * white else 0.0
+
+
+@njit
+def note_sway(state, is_first, settings):
+    """Keep the largest sway of an unbroken run of still windows, of which this is the first or a further one."""
+    force = sway_variance(state, 0, settings.accel_noise_density)
+    rate = sway_variance(state, 3, settings.gyro_noise_density)
+    state.sway_force = force if is_first else max(state.sway_force, force)
+    state.sway_rate = rate if is_first else max(state.sway_rate, rate)
+
+
+@njit
+def can_be_bias(rate, expected, std, noise):
+    """Say whether a mean rate (rad/s) can be Earth rate and gyro bias, expected with ``std``; ``noise``: std."""
+    limit = BIAS_SIGMAS * math.sqrt(std * std + noise * noise) + EARTH_RATE
+    for i in range(3):
+        if abs(rate[i] - expected[i]) > limit:
+            return False
+    return True

@@ -1,0 +1,141 @@
+"""Pseudorange of one signal (payload: see ``signal``).
+
+    pseudorange = |satellite - antenna| + clock bias + offset of the constellation + ionosphere + troposphere
+
+(Groves, section 9.4.1, satellite clock taken out). Jacobian: minus the line of sight u for the position, u x lever for
+the attitude on the map side, one for clock bias and offset. The atmosphere is that of the current position.
+
+What lasts in the errors of all ranges together (reflections, orbits, atmosphere) may be an optional state: it moves the
+antenna that the satellites see by a standard deviation times a state of unit variance per axis (first-order
+Gauss-Markov). Vertically more than horizontally: what the models leave of the atmosphere is above, on all sides.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.measurements.jacobians import clear
+from eskf_ros.filter.state.layout import ATTITUDE, ERROR_SIZE, INTER_SYSTEM, NOWHERE, POSITION
+from eskf_ros.filter.tight.signal import (
+    CARRIER,
+    CN0,
+    FLAGS,
+    GPS_TIME,
+    KLOBUCHAR,
+    MEASURED,
+    NOISE_FACTOR,
+    STD,
+    antenna_ecef,
+    clock_bias,
+    satellite_of,
+    see,
+    system_of,
+    to_map,
+)
+from eskf_ros.geodesy.earth import east_north_up_to_ecef, ecef_to_geodetic
+from eskf_ros.geodesy.rotation import cross, rotate, to_matrix
+from eskf_ros.gnss.atmosphere import ionosphere_scale, klobuchar, troposphere
+from eskf_ros.gnss.geometry import elevation_azimuth
+from eskf_ros.gnss.range_model import UNMODELLED_IONOSPHERE
+from eskf_ros.gnss.ranges import IONOSPHERE_APPLIED, TROPOSPHERE_APPLIED
+from eskf_ros.gnss.signals import GNSS_COUNT, L1
+from eskf_ros.gnss.time import SECONDS_PER_WEEK
+from eskf_ros.gnss.weighting import DEFAULT_WEIGHTING, code_std
+
+SIZE = 1
+
+# Place of a constellation among the offsets, -1 for GPS, to which they refer.
+_ORDER = np.array([INTER_SYSTEM.index(group) if group in INTER_SYSTEM else -1 for group in range(GNSS_COUNT)])
+
+
+@njit
+def offset_place(system, settings):
+    """Return the place of the offset of a constellation in the error state; `NOWHERE` for GPS."""
+    if _ORDER[system] < 0 or settings.inter_system_at == NOWHERE:
+        return NOWHERE
+    return settings.inter_system_at + _ORDER[system]
+
+
+@njit
+def delays(payload, geodetic, elevation, azimuth):
+    """Return the delays (m) in ionosphere (NaN without a model) and troposphere, at a place (rad, rad, m)."""
+    week = math.floor(payload[GPS_TIME] / SECONDS_PER_WEEK)
+    seconds = payload[GPS_TIME] - week * SECONDS_PER_WEEK
+    flags = int(payload[FLAGS])
+    ionosphere = 0.0
+    if not flags & IONOSPHERE_APPLIED:
+        carrier = L1 if math.isnan(payload[CARRIER]) else payload[CARRIER]
+        zenith = klobuchar(payload[KLOBUCHAR:], seconds, geodetic[0], geodetic[1], elevation, azimuth)
+        ionosphere = zenith * ionosphere_scale(carrier)
+    tropospheric = 0.0
+    if not flags & TROPOSPHERE_APPLIED:
+        tropospheric = troposphere(week, seconds, geodetic[0], geodetic[2], elevation)
+    return ionosphere, tropospheric
+
+
+@njit
+def predict(state, payload, source, settings):
+    """Return pseudorange (m), unit vector to the satellite (map), elevation (rad), ionospheric delay (m, or NaN)."""
+    antenna, velocity = antenna_ecef(state, settings)
+    unit, length, _ = see(payload, antenna, velocity)
+    geodetic = ecef_to_geodetic(antenna[0], antenna[1], antenna[2])
+    elevation, azimuth = elevation_azimuth(unit, east_north_up_to_ecef(geodetic[0], geodetic[1]))
+    ionosphere, tropospheric = delays(payload, geodetic, elevation, azimuth)
+    pseudorange = length + clock_bias(state, settings) + tropospheric
+    if not math.isnan(ionosphere):
+        pseudorange += ionosphere
+    place = offset_place(system_of(source), settings)
+    if place < state.error_size:
+        pseudorange += state.optional[place - ERROR_SIZE]
+    unit = to_map(state, unit)
+    place = settings.position_error_at
+    if place < state.error_size:
+        for i in range(3):
+            pseudorange -= unit[i] * settings.range_error_std[i] * state.optional[place - ERROR_SIZE + i]
+    return pseudorange, unit, elevation, ionosphere
+
+
+@njit
+def variance(payload, source, elevation, ionosphere, settings):
+    """Return the variance (m2): the receiver's own where it gave one, else by elevation and C/N0; scaled, floored."""
+    square = payload[STD] ** 2
+    if math.isnan(square):
+        gnss_id, sv_id = satellite_of(source)
+        modelled, unmodelled = ionosphere, 0.0
+        if math.isnan(ionosphere):
+            modelled, unmodelled = 0.0, UNMODELLED_IONOSPHERE / max(0.3, math.sin(elevation))
+        std = code_std(DEFAULT_WEIGHTING, gnss_id, sv_id, elevation, payload[CN0], modelled, payload[NOISE_FACTOR])
+        square = std * std + unmodelled * unmodelled
+    return max(settings.range_covariance_scale * square, settings.code_std_floor**2)
+
+
+@njit
+def linearize(state, payload, source, settings, work):
+    """Write innovation, Jacobian and noise of one pseudorange to ``work``; return 1, or 0 below the elevation mask."""
+    predicted, unit, elevation, ionosphere = predict(state, payload, source, settings)
+    if not elevation >= settings.elevation_mask:
+        return 0
+    clear(work)
+    work.innovation[0] = payload[MEASURED] - predicted
+    work.noise[0, 0] = variance(payload, source, elevation, ionosphere, settings)
+    lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[0])
+    across = cross(unit, lever)
+    for i in range(3):
+        work.jacobian[0, POSITION + i] = -unit[i]
+        if state.heading_known == 1:
+            work.jacobian[0, ATTITUDE + i] = across[i]
+    if state.heading_known == 0:
+        # The lever arm points anywhere around the vertical: its horizontal length is an error of the prediction.
+        work.noise[0, 0] += (lever[0] ** 2 + lever[1] ** 2) * (unit[0] ** 2 + unit[1] ** 2)
+    work.jacobian[0, settings.clock_at] = 1.0
+    place = offset_place(system_of(source), settings)
+    if place < state.error_size:
+        work.jacobian[0, place] = 1.0
+    place = settings.position_error_at
+    if place < state.error_size:
+        for i in range(3):
+            work.jacobian[0, place + i] = -unit[i] * settings.range_error_std[i]
+    return SIZE

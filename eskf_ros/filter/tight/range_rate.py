@@ -1,0 +1,100 @@
+"""Range rate of one signal, from its Doppler (payload: see ``signal``).
+
+    range rate = u . (satellite velocity - antenna velocity) + clock drift
+
+(Groves, section 9.4.1, satellite drift taken out), u the line of sight, with the antenna's velocity + R (omega x
+lever_arm), omega the body rate relative to the Earth, free of the gyro bias. The Jacobian has the velocity, the
+position, which turns the line of sight, attitude and gyro bias, as for a GNSS velocity, and the clock drift.
+"""
+
+from __future__ import annotations
+
+import math
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.inertial.navigation_frame import body_rate
+from eskf_ros.filter.measurements.jacobians import clear
+from eskf_ros.filter.state.layout import ATTITUDE, GYRO_BIAS, POSITION, VELOCITY
+from eskf_ros.filter.tight.signal import (
+    CN0,
+    MEASURED,
+    SATELLITE_VELOCITY,
+    STD,
+    antenna_ecef,
+    clock_drift,
+    see,
+    to_map,
+)
+from eskf_ros.geodesy.earth import east_north_up_to_ecef, ecef_to_geodetic
+from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix
+from eskf_ros.gnss.geometry import elevation_azimuth
+from eskf_ros.gnss.weighting import DEFAULT_WEIGHTING, doppler_std
+
+SIZE = 1
+
+
+@njit
+def predict(state, payload, settings):
+    """Return range rate (m/s), unit vector to the satellite (map), elevation (rad), turning of that vector (1/s, map).
+
+    The turning is how the range rate changes with the position of the antenna, but for the sign.
+    """
+    antenna, velocity = antenna_ecef(state, settings)
+    unit, length, rate = see(payload, antenna, velocity)
+    latitude, longitude, _ = ecef_to_geodetic(antenna[0], antenna[1], antenna[2])
+    elevation, _ = elevation_azimuth(unit, east_north_up_to_ecef(latitude, longitude))
+    v = SATELLITE_VELOCITY
+    relative = (payload[v] - velocity[0], payload[v + 1] - velocity[1], payload[v + 2] - velocity[2])
+    along = dot(unit, relative)
+    turning = (
+        (relative[0] - along * unit[0]) / length,
+        (relative[1] - along * unit[1]) / length,
+        (relative[2] - along * unit[2]) / length,
+    )
+    return rate + clock_drift(state, settings), to_map(state, unit), elevation, to_map(state, turning)
+
+
+@njit
+def variance(payload, settings):
+    """Return the variance (m2/s2): the receiver's own where it gave one, else by C/N0; scaled, floored."""
+    std = payload[STD]
+    if math.isnan(std):
+        std = doppler_std(DEFAULT_WEIGHTING, payload[CN0])
+    return max(settings.range_covariance_scale * std * std, settings.range_rate_std_floor**2)
+
+
+@njit
+def linearize(state, payload, settings, work):
+    """Write innovation, Jacobian and noise of one range rate to ``work``; return 1, or 0 below the elevation mask."""
+    predicted, unit, elevation, turning = predict(state, payload, settings)
+    if not elevation >= settings.elevation_mask:
+        return 0
+    clear(work)
+    work.innovation[0] = payload[MEASURED] - predicted
+    rotation = to_matrix(state.attitude)
+    arm = settings.lever_arms_body[0]
+    lever = rotate(rotation, arm)
+    sway = rotate(rotation, cross(body_rate(state, rotation), arm))
+    across = cross(unit, lever)
+    # The gyro reading of this instant carries the white noise of one sample.
+    gyro_variance = settings.gyro_noise_density**2 / state.imu_interval * dot(across, across)
+    work.noise[0, 0] = variance(payload, settings) + gyro_variance
+    for i in range(3):
+        work.jacobian[0, POSITION + i] = -turning[i]
+        work.jacobian[0, VELOCITY + i] = -unit[i]
+    work.jacobian[0, settings.clock_at + 1] = 1.0
+    if state.heading_known == 0:
+        work.noise[0, 0] += dot(sway, sway)
+        return SIZE
+    # An attitude error turns the sway, and the Earth rate into the body: [lever]x [Earth rate]x theta.
+    earth = state.earth_rate_map
+    swayed = cross(unit, sway)
+    # It moves the antenna too, and so turns the line of sight.
+    moved = cross(turning, lever)
+    along, aligned = dot(unit, earth), dot(lever, earth)
+    # u R [lever_arm]x for the gyro bias.
+    turned = cross(rotate_back(rotation, unit), arm)
+    for i in range(3):
+        work.jacobian[0, ATTITUDE + i] = swayed[i] + moved[i] - along * lever[i] + aligned * unit[i]
+        work.jacobian[0, GYRO_BIAS + i] = -turned[i]
+    return SIZE

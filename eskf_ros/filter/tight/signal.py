@@ -1,0 +1,103 @@
+"""What the aids of one signal have in common: its payload, the antenna, the line of sight.
+
+Payload of a pseudorange and of a range rate alike: the measured value (m, m/s; satellite clock and group delay taken
+out), its standard deviation (NaN: by model), satellite position and velocity (ECEF at transmission, m, m/s), flags of
+`gnss.ranges`, carrier (Hz), C/N0 (dB-Hz, NaN unknown), noise factor, and for the atmosphere GPS time (s since 6 January
+1980) and the eight parameters of Klobuchar (NaN: none). The source names the signal.
+"""
+
+from __future__ import annotations
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.inertial.navigation_frame import body_rate
+from eskf_ros.filter.state.layout import ERROR_SIZE
+from eskf_ros.geodesy.rotation import cross, rotate, rotate_back, to_matrix
+from eskf_ros.gnss.geometry import line_of_sight
+from eskf_ros.gnss.ranges import ALREADY_TURNED
+from eskf_ros.gnss.signals import LETTERS, SIGNALS, time_group
+
+MEASURED = 0
+STD = 1
+SATELLITE = 2
+SATELLITE_VELOCITY = 5
+FLAGS = 8
+CARRIER = 9
+CN0 = 10
+NOISE_FACTOR = 11
+GPS_TIME = 12
+KLOBUCHAR = 13
+FIELD = 21
+
+LETTER_OF = {int(gnss): letter for letter, gnss in LETTERS.items()}
+
+
+@njit
+def source_of(gnss_id, sv_id, signal):
+    """Return the number that names a signal among the sources of a stream."""
+    return (gnss_id * 256 + sv_id) * 256 + signal
+
+
+@njit
+def satellite_of(source):
+    """Return ``gnss_id`` and ``sv_id`` of a source."""
+    return source >> 16, (source >> 8) & 255
+
+
+def name_of(source: int) -> str:
+    """Return the name of a signal as RINEX has it: constellation and satellite, band and attribute ("G07 1C")."""
+    gnss_id, sv_id, signal = source >> 16, (source >> 8) & 255, source & 255
+    letter = LETTER_OF.get(gnss_id, "?")
+    code = SIGNALS[signal].code if signal < len(SIGNALS) else "?"
+    return f"{letter}{sv_id:02d} {code}"
+
+
+@njit
+def system_of(source):
+    """Return which satellites share an offset in the receiver's clock (`gnss.signals.time_group`)."""
+    gnss_id, sv_id = satellite_of(source)
+    return time_group(gnss_id, sv_id)
+
+
+@njit
+def clock_bias(state, settings):
+    """Return the bias of the receiver's clock (m)."""
+    return state.optional[settings.clock_at - ERROR_SIZE]
+
+
+@njit
+def clock_drift(state, settings):
+    """Return the drift of the receiver's clock (m/s)."""
+    return state.optional[settings.clock_at + 1 - ERROR_SIZE]
+
+
+@njit
+def antenna_ecef(state, settings):
+    """Return position (m) and velocity (m/s) of the antenna of the first receiver, ECEF."""
+    rotation = to_matrix(state.attitude)
+    arm = settings.lever_arms_body[0]
+    p, v = state.position_map, state.velocity_map
+    lever = rotate(rotation, arm)
+    sway = rotate(rotation, cross(body_rate(state, rotation), arm))
+    offset = rotate(state.map_to_ecef, (p[0] + lever[0], p[1] + lever[1], p[2] + lever[2]))
+    velocity = rotate(state.map_to_ecef, (v[0] + sway[0], v[1] + sway[1], v[2] + sway[2]))
+    origin = state.origin_ecef
+    return (origin[0] + offset[0], origin[1] + offset[1], origin[2] + offset[2]), velocity
+
+
+@njit
+def see(payload, position, velocity):
+    """Return unit vector to the satellite (ECEF), range (m), range rate (m/s) from an antenna with this motion."""
+    p, v = SATELLITE, SATELLITE_VELOCITY
+    return line_of_sight(
+        (payload[p], payload[p + 1], payload[p + 2]),
+        (payload[v], payload[v + 1], payload[v + 2]),
+        position,
+        velocity,
+        int(payload[FLAGS]) & ALREADY_TURNED != 0,
+    )
+
+
+@njit
+def to_map(state, vector_ecef):
+    """Return a vector in map axes."""
+    return rotate_back(state.map_to_ecef, vector_ecef)

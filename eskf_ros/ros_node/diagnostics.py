@@ -1,0 +1,278 @@
+"""The node's diagnostics: the state, what it waits for, what is wrong and what to do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from eskf_ros.filter.state.layout import SOURCES, STREAM_NAMES, Phase, Status, Stream, Verdict
+from eskf_ros.filter.tight.signal import name_of
+from eskf_ros.gnss.signals import BEIDOU_3, Gnss
+from eskf_ros.ros_node.clocks import SECOND, StampMonitor, clock_complaints
+from eskf_ros.ros_node.messages import key_values
+
+if TYPE_CHECKING:
+    from eskf_ros.ros_node.node import EskfNode
+
+RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
+TRANSIENT_LOCAL, VOLATILE = DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE
+
+SILENCE = 3.0
+"""Seconds without a message after which a topic is called silent."""
+
+FEWEST_TO_SOLVE = 4
+"""Satellites that fix a position by themselves."""
+
+GROUP_NAMES = {**{int(gnss): gnss.name.lower() for gnss in Gnss}, BEIDOU_3: "beidou-3", int(Gnss.BEIDOU): "beidou-2"}
+"""What `gnss.signals.time_group` tells apart."""
+
+PHASE_LABELS = {
+    Stream.GNSS_POSITION: "fixes",
+    Stream.GNSS_VELOCITY: "velocities",
+    Stream.PSEUDORANGE: "position by pseudoranges",
+}
+SENSORS = (
+    *((stream, 0) for stream in (Stream.HEADING, Stream.MAG, Stream.WHEEL, Stream.BODY_VELOCITY, Stream.BARO)),
+    *((stream, source) for stream in (Stream.GNSS_POSITION, Stream.GNSS_VELOCITY) for source in range(SOURCES)),
+)
+"""Streams, and for receivers which of them, whose phase is told once something came."""
+
+
+def status_report(node: EskfNode, stamp: Time) -> DiagnosticArray:
+    """One status: OK when the state is GOOD and nothing is wrong, ERROR when nothing is published any more."""
+    now = node.now()
+    row = node.navigator.odometry[0]
+    status = Status(int(row["status"]))
+    is_silent = status > Status.WAITING_IMU and bool(missing(node, [node.imu_monitor], now))
+    if is_silent and status != Status.FAULT:
+        # Whatever the estimate was worth: nothing is published without the IMU.
+        status = Status.WAITING_IMU
+    of_ranges = [] if node.range_intake is None else node.range_intake.recent_complaints
+    problems = [*node.navigator.complaints, *of_ranges, *clock_complaints(node.monitors, now)]
+    problems += [*mismatches(node), *second_publishers(node), *node.trouble.problems()]
+    waiting = waiting_for(node, status, row, now)
+    level = DiagnosticStatus.OK if status == Status.GOOD and not problems else DiagnosticStatus.WARN
+    if status == Status.FAULT or is_silent:
+        level = DiagnosticStatus.ERROR
+    report = DiagnosticArray()
+    report.header.stamp = stamp
+    report.status.append(
+        DiagnosticStatus(
+            level=level,
+            name=f"{node.get_fully_qualified_name()}: navigation",
+            hardware_id="eskf_ros",
+            message="; ".join([status.name, *waiting, *problems]),
+            values=key_values({**figures(node, row), **ranges(node), **counters(node), **topics(node, now)}),
+        )
+    )
+    return report
+
+
+def waiting_for(node: EskfNode, status: Status, row: np.void, now: int) -> list[str]:
+    """What keeps the state from the next rung."""
+    wanted_input = "gnss_fix" if node.range_intake is None else "ranges"
+    fixes = next(source for source in node.aid_inputs if source.kind.name == wanted_input).monitors
+    is_tight = node.position_stream == Stream.PSEUDORANGE
+    if status in (Status.WAITING_IMU, Status.LEVELLING):
+        return missing(node, [node.imu_monitor], now) or ["standing still or driving steadily for a moment"]
+    if status == Status.FAULT:
+        return ["a reset: call the service ~/reset"]
+    if status == Status.DEGRADED:
+        return [f"{'ranges' if is_tight else 'fixes'} that agree with the estimate: see eskf/aids"]
+    if status in (Status.WAITING_FIX, Status.COASTING):
+        unaccepted = (
+            "ranges come, but too few were accepted lately" if is_tight else "fixes come, but none was accepted lately"
+        )
+        return missing(node, fixes, now) or held_by_few(node, row) or [f"{unaccepted}{latest_verdicts(node)}"]
+    if status == Status.WAITING_HEADING:
+        way = "speeding up, braking or turning tells the heading, a constant velocity does not"
+        return missing(node, fixes, now) or [way]
+    if status == Status.ALIGNING:
+        std, wanted = math.degrees(math.sqrt(row["pose_covariance"][5, 5])), node.parameters.alignment
+        wanted_std = wanted.good_heading_std_deg
+        return [f"a heading to {wanted_std:g} deg, which is known to {std:.1f} deg: drive, speed up, brake, turn"]
+    return []
+
+
+def held_by_few(node: EskfNode, row: np.void) -> list[str]:
+    """Say so when satellites that are too few for a position of their own are fused nevertheless."""
+    epoch = node.navigator.latest_epoch
+    fused = epoch[np.isin(epoch["verdict"], (Verdict.FUSED, Verdict.WEIGHED_DOWN))]
+    count = len({name_of(source).split()[0] for source in fused["source"].tolist()})
+    if not 0 < count < FEWEST_TO_SOLVE or row["stamp"] - fused["stamp"][0] > SILENCE * SECOND:
+        return []
+    return [
+        "1 satellite is fused: it and the IMU hold the position"
+        if count == 1
+        else f"{count} satellites are fused: they and the IMU hold the position"
+    ]
+
+
+def latest_verdicts(node: EskfNode) -> str:
+    """What became of the fixes, or of the pseudoranges, of the last report that has some."""
+    counts = node.latest_positions
+    told = ", ".join(f"{count} {verdict.name.lower()}" for verdict, count in sorted(counts.items()))
+    return f" (the last: {told}): see eskf/aids" if told else ": see eskf/aids"
+
+
+def missing(node: EskfNode, monitors: Sequence[StampMonitor], now: int) -> list[str]:
+    """Say so when nothing comes on a topic, from any of those watched on it, and who could send."""
+    silences = [silence for monitor in monitors if not math.isnan(silence := monitor.timing(now).silence)]
+    if silences and min(silences) <= SILENCE:
+        return []
+    topic = monitors[0].topic
+    publishers = node.count_publishers(topic)
+    since = f"no message for {min(silences):.0f} s" if silences else "no message"
+    return [f"{since} on {topic}; {publishers} publisher{'' if publishers == 1 else 's'}{elsewhere(node, topic)}"]
+
+
+def elsewhere(node: EskfNode, topic: str) -> str:
+    """Where else messages of the type of an input are published, if nobody publishes them on its topic."""
+    if node.count_publishers(topic):
+        return ""
+    kind = next(type_name(subscription.msg_type) for subscription, _ in node.inputs if subscription.topic_name == topic)
+    own = {subscription.topic_name for subscription, _ in node.inputs}
+    others = [
+        name
+        for name, types in node.get_topic_names_and_types()
+        if kind in types and name not in own and node.count_publishers(name)
+    ]
+    return f" ({kind} is published on {', '.join(others[:3])})" if others else ""
+
+
+def mismatches(node: EskfNode) -> list[str]:
+    """Publishers whose messages cannot reach us, and subscribers that ours cannot reach: type or quality of service."""
+    found = []
+    for subscription, kind in node.inputs:
+        wanted, expected = subscription.qos_profile, type_name(subscription.msg_type)
+        for other in node.get_publishers_info_by_topic(subscription.topic_name):
+            reason = ""
+            if other.topic_type != expected:
+                reason = f"sends {other.topic_type}, {expected} is expected"
+                if kind is not None and other.topic_type in kind.types:
+                    reason += f" unless topics.{kind.name}_type says otherwise"
+            elif wanted.reliability == RELIABLE and other.qos_profile.reliability == BEST_EFFORT:
+                reason = "is best effort, this node was told to ask for reliable (qos_overrides)"
+            elif wanted.durability == TRANSIENT_LOCAL and other.qos_profile.durability == VOLATILE:
+                reason = "is volatile, this node was told to ask for transient local (qos_overrides)"
+            if reason:
+                found.append(f"the publisher {node_name(other)} of {subscription.topic_name} {reason}")
+    for publisher in node.output_publishers:
+        offered = publisher.qos_profile
+        for other in node.get_subscriptions_info_by_topic(publisher.topic_name):
+            reason = ""
+            if other.qos_profile.reliability == RELIABLE and offered.reliability == BEST_EFFORT:
+                reason = "asks for reliable, but is offered best effort (qos_overrides)"
+            elif other.qos_profile.durability == TRANSIENT_LOCAL and offered.durability == VOLATILE:
+                reason = "asks for transient local, but is offered volatile"
+            if reason:
+                found.append(f"the subscriber {node_name(other)} of {publisher.topic_name} {reason}")
+    return found
+
+
+def type_name(kind: Any) -> str:
+    """sensor_msgs/msg/Imu of the class."""
+    package, subfolder = kind.__module__.split(".")[:2]
+    return f"{package}/{subfolder}/{kind.__name__}"
+
+
+def node_name(endpoint: TopicEndpointInfo) -> str:
+    """Name of the node at one end of a topic."""
+    return f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
+
+
+def second_publishers(node: EskfNode) -> list[str]:
+    """Transforms that are ours and that somebody else publishes too."""
+    output = node.outputs.transforms
+    if output is None or not output.watch.strangers:
+        return []
+    own = node.get_fully_qualified_name()
+    names = sorted({node_name(end) for end in node.get_publishers_info_by_topic("/tf")} - {own})
+    return [
+        f"the transform {', '.join(output.watch.strangers)} is published by another node too (publishers of /tf: "
+        f"{', '.join(names) or own}): stop one of them, or set output.tf to map_to_odom or none"
+    ]
+
+
+def figures(node: EskfNode, row: np.void) -> dict[str, object]:
+    """Uncertainty, biases, and how much was published."""
+    sigma = [math.sqrt(max(0.0, row["pose_covariance"][i, i])) for i in range(6)]
+    return {
+        "position std (m)": " ".join(f"{value:.3f}" for value in sigma[:3]),
+        "velocity std (m/s)": " ".join(f"{math.sqrt(max(0.0, row['twist_covariance'][i, i])):.3f}" for i in range(3)),
+        "heading std (deg)": f"{math.degrees(sigma[5]):.2f}",
+        "accelerometer bias (m/s2)": " ".join(f"{value:.4f}" for value in row["accel_bias"]),
+        "gyro bias (rad/s)": " ".join(f"{value:.6f}" for value in row["gyro_bias"]),
+        "odometries published": node.outputs.published,
+        "restarts": node.navigator.restarts,
+        "position resets": node.navigator.position_resets,
+        **phases(node),
+        "resets": node.resets,
+        "datum": node.navigator.datum,
+        "window needed (s)": node.navigator.window_needed,
+        "history (kB)": node.navigator.held_bytes // 1024,
+        "callback (ms)": f"{1e3 * node.callback_time / max(1, node.callbacks):.3f}",
+        "longest callback (ms)": f"{1e3 * node.longest_callback:.2f}",
+        **{f"place of the {sensor}": node.extrinsics.source_of(sensor) for sensor in node.extrinsics.sensors},
+    }
+
+
+def phases(node: EskfNode) -> dict[str, object]:
+    """What the measurements of the first receiver are to the filter, and of the other sensors those that came."""
+    usual: tuple[Stream, ...] = (Stream.PSEUDORANGE,)
+    if node.position_stream != Stream.PSEUDORANGE:
+        usual = (Stream.GNSS_POSITION, Stream.GNSS_VELOCITY)
+    found = {(stream, 0): node.navigator.phase(stream) for stream in usual}
+    for stream, source in SENSORS:
+        phase = node.navigator.phase(stream, source)
+        if phase != Phase.WAITING:
+            found[stream, source] = phase
+    return {
+        PHASE_LABELS.get(stream, stream.name.lower().replace("_", " ")) + " of the second receiver" * source: phase.name
+        for (stream, source), phase in found.items()
+    }
+
+
+def ranges(node: EskfNode) -> dict[str, object]:
+    """What is known of the receiver's clock, and what became of the signals before the filter."""
+    navigator, intake = node.navigator, node.range_intake
+    if intake is None:
+        return {}
+    found: dict[str, object] = {"epochs of ranges": intake.epochs, "point solutions": intake.solved}
+    found.update({f"signals {status.name.lower()}": n for status, n in sorted(navigator.range_statuses.items())})
+    if node.position_stream != Stream.PSEUDORANGE:
+        return found
+    if navigator.clock is not None:
+        bias, drift = navigator.clock
+        found.update({"clock bias (m)": f"{bias:.2f}", "clock drift (m/s)": f"{drift:.3f}"})
+    for group, offset in navigator.inter_system_offsets.items():
+        found[f"clock offset of {GROUP_NAMES[group]} (m)"] = f"{offset:.2f}"
+    return {**found, "clock jumps (ms)": navigator.clock_jumps, "range faults": navigator.range_faults}
+
+
+def counters(node: EskfNode) -> dict[str, object]:
+    """Measurements by stream and final verdict, IMU samples by what became of them, trouble by kind."""
+    found: dict[str, object] = {
+        f"{STREAM_NAMES[stream]} {verdict.name.lower()}": count for (stream, verdict), count in node.verdicts.items()
+    }
+    found.update({f"trouble: {kind}": count for kind, count in node.trouble.counts.items()})
+    found.update({f"imu {name}": count for name, count in node.navigator.imu_counts.items()})
+    return found
+
+
+def topics(node: EskfNode, now: int) -> dict[str, object]:
+    """Rate and delay of each input that was heard of."""
+    found: dict[str, object] = {}
+    for monitor in node.monitors:
+        timing = monitor.timing(now)
+        if not math.isnan(timing.silence):
+            found[f"{monitor.label} rate (Hz)"] = f"{timing.rate:.1f}"
+            found[f"{monitor.label} delay (s)"] = f"{timing.delay:.3f} +- {timing.spread:.3f}"
+    return found

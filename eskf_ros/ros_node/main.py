@@ -1,0 +1,84 @@
+"""The command `eskf_node`."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from eskf_ros.ros_node.process import StartError, StopFlag, run
+
+USAGE = """\
+usage: eskf_node [--ros-args --params-file FILE -p NAME:=VALUE -r FROM:=TO ...]
+
+Error-state Kalman filter: imu/data and gps/fix (gps/vel) in, odometry/global and odometry/local out at IMU rate.
+config/eskf.yaml lists every parameter.
+
+       eskf_node --compile
+
+Compile the estimator for this processor and end: the next start, of this user, takes a second instead of a minute
+(for the build of an image; needs no ROS). NUMBA_CACHE_DIR says where the machine code is kept.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the node until SIGINT or SIGTERM; returns 0, or 2 when an argument or a parameter cannot be used."""
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    if words and words[0] in ("-h", "--help"):
+        print(USAGE, end="")
+        return 0
+    if words == ["--compile"]:
+        return _compile()
+    stop = StopFlag()
+    try:
+        from rclpy.executors import ExternalShutdownException  # noqa: F401 - tells whether ROS is there
+    except ImportError:
+        print(
+            "eskf_node: rclpy is not there: source a ROS 2 installation, or pip install eskf_ros[ros]",
+            file=sys.stderr,
+        )
+        return 2
+    from eskf_ros.parameters import ParameterError
+
+    try:
+        run(_create, stop, arguments)
+    except (ParameterError, StartError) as error:
+        print(f"eskf_node: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _compile() -> int:
+    """Compile all that a node calls, in both modes, and say where the machine code is."""
+    from eskf_ros.compiled import CACHE_FOLDER, COMPILED, sentence_on_compiling, while_compiling
+
+    def say(text: str) -> None:
+        print(f"eskf_node: {text}", flush=True)
+
+    if not COMPILED:
+        print("eskf_node: numba is missing or switched off: there is nothing to compile", file=sys.stderr)
+        return 2
+    from eskf_ros.parameters import Parameters
+    from eskf_ros.ros_node.warm_up import compile_node
+
+    with while_compiling(sentence_on_compiling(say)):
+        compile_node(Parameters(), with_ranges=True)
+    say(f"compiled; the machine code is in {CACHE_FOLDER or os.environ.get('NUMBA_CACHE_DIR')}")
+    return 0
+
+
+def _create() -> Any:
+    from rclpy.exceptions import ParameterException
+
+    from eskf_ros.ros_node.node import EskfNode
+
+    try:
+        return EskfNode()
+    except (ParameterException, RuntimeError) as error:
+        # rclpy's own parameters, such as those of qos_overrides, and names that cannot be.
+        raise StartError(error) from error
+
+
+if __name__ == "__main__":
+    sys.exit(main())

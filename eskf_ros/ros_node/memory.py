@@ -1,0 +1,77 @@
+"""The file that carries biases, place and heading from one run of the node to the next."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from eskf_ros.filter.alignment.warm_start import Memory
+
+VERSION = 1
+VECTORS = ("accel_bias", "accel_bias_std", "gyro_bias", "gyro_bias_std")
+LARGEST_FLOAT = sys.float_info.max
+
+
+def write_memory(path: Path, memory: Memory) -> None:
+    """Write the file as a whole or not at all: a robot may lose its power at any moment. Raises OSError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            json.dump({"version": VERSION, **dataclasses.asdict(memory)}, file, indent=2)
+            file.write("\n")
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(name, path)
+    except BaseException:
+        os.unlink(name)
+        raise
+
+
+def read_memory(path: Path) -> Memory | None:
+    """Read the file; None when there is none. Raises ValueError saying what is wrong with it."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    # Brackets by the thousand are a RecursionError.
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path} cannot be read: {error}") from error
+    try:
+        return _checked(content)
+    except ValueError as error:
+        raise ValueError(f"{path} is not a warm start file of this version: {error}") from error
+
+
+def _checked(content: object) -> Memory:
+    if not isinstance(content, dict):
+        raise ValueError("not a JSON object")
+    if content.get("version") != VERSION:
+        raise ValueError(f"version is {content.get('version')!r}, not {VERSION}")
+    wanted = [field.name for field in dataclasses.fields(Memory)]
+    missing, unknown = set(wanted) - content.keys(), content.keys() - {"version", *wanted}
+    if missing or unknown:
+        raise ValueError(f"missing: {sorted(missing)}, unknown: {sorted(unknown)}")
+    return Memory(**{name: _value(name, content[name]) for name in wanted})
+
+
+def _value(name: str, given: object) -> Any:
+    if name in VECTORS:
+        if not isinstance(given, list) or len(given) != 3 or not all(map(_is_finite, given)):
+            raise ValueError(f"{name} is not three finite numbers")
+        return tuple(given)
+    if not _is_finite(given):
+        raise ValueError(f"{name} is not a finite number")
+    if name == "stamp" and not isinstance(given, int):
+        raise ValueError("stamp is not a whole number")
+    return given
+
+
+def _is_finite(value: object) -> bool:
+    """Whether it is a number that a float can hold; an integer of JSON may be larger, and True is an int too."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and -LARGEST_FLOAT <= value <= LARGEST_FLOAT

@@ -1,0 +1,102 @@
+"""The messages the node sends seldom: biases, the filtered fix, the verdicts."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import TwistWithCovarianceStamped
+from sensor_msgs.msg import NavSatFix, NavSatStatus
+
+from eskf_ros.filter.state.layout import STREAM_NAMES, Stream, Verdict
+from eskf_ros.filter.tight.signal import name_of
+from eskf_ros.geodesy.map_frame import MapFrame
+from eskf_ros.gnss.point_solution import PointSolution, SolutionStatus
+
+SECOND = 1_000_000_000
+
+GOOD_VERDICTS = (Verdict.FUSED, Verdict.WEIGHED_DOWN, Verdict.DUPLICATE, Verdict.DISABLED)
+"""Nothing is wrong with what got one of these."""
+
+SIGNALS = (Stream.PSEUDORANGE, Stream.RANGE_RATE)
+"""Streams whose sources are signals of satellites."""
+
+
+def set_header(header: Any, stamp: int, frame: str) -> None:
+    """Fill in a message header; ``stamp`` in ns, negative before the first message."""
+    header.stamp.sec, header.stamp.nanosec = divmod(max(0, stamp), SECOND)
+    header.frame_id = frame
+
+
+def key_values(values: dict[str, object]) -> list[KeyValue]:
+    """Turn a mapping into the form diagnostics have."""
+    return [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+
+
+def bias_message(row: np.void, frame: str) -> TwistWithCovarianceStamped:
+    """Biases in the axes of the IMU, whose frame it is: linear m/s2 of the accelerometer, angular rad/s of the gyro."""
+    message = TwistWithCovarianceStamped()
+    set_header(message.header, int(row["stamp"]), frame)
+    linear, angular = message.twist.twist.linear, message.twist.twist.angular
+    linear.x, linear.y, linear.z = row["accel_bias"].tolist()
+    angular.x, angular.y, angular.z = row["gyro_bias"].tolist()
+    variances = np.concatenate([row["accel_bias_std"], row["gyro_bias_std"]]) ** 2
+    message.twist.covariance = np.diag(variances).ravel()
+    return message
+
+
+def fix_message(row: np.void, datum: tuple[float, float, float], frame: str) -> NavSatFix:
+    """The position of base_link as NavSatFix, covariance in east, north, up of the map."""
+    message = NavSatFix()
+    set_header(message.header, int(row["stamp"]), frame)
+    message.status.status = NavSatStatus.STATUS_FIX
+    message.latitude, message.longitude, message.altitude = MapFrame(datum).to_geodetic_deg(row["position_map"])
+    message.position_covariance = np.ascontiguousarray(row["pose_covariance"][:3, :3]).ravel()
+    message.position_covariance_type = NavSatFix.COVARIANCE_TYPE_KNOWN
+    return message
+
+
+def solution_message(solution: PointSolution, stamp: int, frame: str) -> NavSatFix:
+    """The position of the antenna by the ranges of one epoch alone, in the frame of the message they came in."""
+    message = NavSatFix()
+    set_header(message.header, stamp, frame)
+    if solution.status != SolutionStatus.SOLVED:
+        message.status.status = NavSatStatus.STATUS_NO_FIX
+        message.latitude = message.longitude = message.altitude = math.nan
+        return message
+    latitude, longitude, message.altitude = map(float, solution.geodetic)
+    message.status.status = NavSatStatus.STATUS_FIX
+    message.latitude, message.longitude = math.degrees(latitude), math.degrees(longitude)
+    message.position_covariance = np.ascontiguousarray(solution.covariance_enu, np.float64).ravel()
+    message.position_covariance_type = NavSatFix.COVARIANCE_TYPE_KNOWN
+    return message
+
+
+def record_statuses(records: np.ndarray, stamp: Time) -> DiagnosticArray:
+    """One status per measurement: what became of it, and which receiver (0 the first) or which signal it is from."""
+    message = DiagnosticArray()
+    message.header.stamp = stamp
+    for record in records:
+        verdict = Verdict(int(record["verdict"]))
+        good = verdict in GOOD_VERDICTS
+        stream, source = int(record["stream"]), int(record["source"])
+        message.status.append(
+            DiagnosticStatus(
+                level=DiagnosticStatus.OK if good else DiagnosticStatus.WARN,
+                name=STREAM_NAMES[stream],
+                message=verdict.name.lower(),
+                values=key_values(
+                    {
+                        **({"signal": name_of(source)} if stream in SIGNALS else {"receiver": source}),
+                        "stamp": f"{int(record['stamp']) // SECOND}.{int(record['stamp']) % SECOND:09d}",
+                        "nis": float(record["nis"]),
+                        "dof": int(record["dof"]),
+                        "innovation": " ".join(f"{value:.4f}" for value in record["innovation"]),
+                    }
+                ),
+            )
+        )
+    return message
