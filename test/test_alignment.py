@@ -26,10 +26,12 @@ from eskf_ros.filter.alignment import first_fix, levelling
 from eskf_ros.filter.alignment import heading as heading_start
 from eskf_ros.filter.inertial import navigation_frame
 from eskf_ros.filter.inertial.strapdown import gravity_map
+from eskf_ros.filter.integrity.restart import restart
 from eskf_ros.filter.loop import update_rest
 from eskf_ros.filter.measurements import gnss_position
 from eskf_ros.filter.state.layout import AID, allocate, blank_state
 from eskf_ros.filter.state.time import NEVER
+from eskf_ros.filter.stationarity import static_window
 
 Array = NDArray[np.float64]
 
@@ -458,7 +460,7 @@ def test_restart_while_standing_still_counts_from_zero() -> None:
     force, rate = at_rest(state, Rotation.identity(), np.zeros(3), bias)
     watch(state, settings, 20.5, force, rate)
     np.testing.assert_allclose(state["gyro_bias"], bias, rtol=0.0, atol=1e-4)
-    first_fix.restart(state)
+    restart(state)
     state["stamp"] += 6_000_000_000
     watch(state, settings, 2.5, force, rate)
     assert state["level_known"] == 1
@@ -474,7 +476,7 @@ def test_restart_under_way_does_not_know_the_heading_of_the_start() -> None:
     watch(state, settings, 2.5, force, rate)
     assert state["heading_known"] == 1
     state["attitude"] = to_quaternion(Rotation.from_euler("z", 170.0, degrees=True))
-    first_fix.restart(state)
+    restart(state)
     state["stamp"] += 6_000_000_000
     watch(state, settings, 2.5, force, rate)
     assert state["heading_known"] == 0 or core(state)[8, 8] > 0.5
