@@ -21,7 +21,7 @@ from markdown_table import table
 from monte_carlo import NO_SIDE_SLIP, Array, Run, feed, nees, run, state_error
 
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.filter.state.layout import POSITION
+from eskf_ros.filter.state.error_state import POSITION
 from eskf_ros.parameters import from_mapping
 from eskf_ros.simulate.episodes import Episode, Outage
 from eskf_ros.simulate.gnss_episodes import BadFixes, ClaimedStd, Multipath, Spoofing, ZeroCovariance

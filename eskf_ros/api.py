@@ -36,9 +36,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from eskf_ros.filter.history.records import RECORD
 from eskf_ros.filter.history.timeline import EARLY_AIDS, JUMP_CONFIRMATIONS, LARGEST_JUMP
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.filter.state.layout import CONSTRAINTS, ODOMETRY, RECORD, STREAM_NAMES, Status, Stream, Verdict
+from eskf_ros.filter.output.global_odometry import ODOMETRY
+from eskf_ros.filter.state.enums import CONSTRAINTS, STREAM_NAMES, Status, Stream, Verdict
 from eskf_ros.geodesy.map_frame import MapFrame, to_geodetic
 from eskf_ros.parameters import Parameters, from_mapping, load
 from eskf_ros.replay.summary import CHI_SQUARE_95, counted, final_result, named

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.filter.state.layout import Stream
+from eskf_ros.filter.state.enums import Stream
 from eskf_ros.parameters import from_mapping
 from eskf_ros.simulate.recording import Recording
 

@@ -24,12 +24,14 @@ from scipy.stats import chi2
 
 from eskf_ros.filter.alignment import first_fix, levelling
 from eskf_ros.filter.alignment import heading as heading_start
+from eskf_ros.filter.history.records import AID
 from eskf_ros.filter.inertial import navigation_frame
 from eskf_ros.filter.inertial.strapdown import gravity_map
 from eskf_ros.filter.integrity.restart import restart
 from eskf_ros.filter.loop import update_rest
 from eskf_ros.filter.measurements import gnss_position
-from eskf_ros.filter.state.layout import AID, allocate, blank_state
+from eskf_ros.filter.state.layout import blank_state
+from eskf_ros.filter.state.memory import allocate
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity import static_window
 

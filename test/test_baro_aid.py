@@ -15,7 +15,8 @@ from test_aiding import geodetic_of
 
 from eskf_ros.filter.measurements import baro
 from eskf_ros.filter.state import augmented_states
-from eskf_ros.filter.state.layout import ERROR_SIZE, Stream, Verdict
+from eskf_ros.filter.state.enums import Stream, Verdict
+from eskf_ros.filter.state.error_state import ERROR_SIZE
 from eskf_ros.simulate.barometer import Barometer, standard_pressure
 from eskf_ros.simulate.recording import Recording
 from eskf_ros.simulate.scenario import simulate

@@ -20,7 +20,7 @@ from kernels import core
 from eskf_ros.filter import fuse, navigator, predict, settings
 from eskf_ros.filter.measurements import kalman_update
 from eskf_ros.filter.state import layout
-from eskf_ros.filter.state.layout import ACCEL_BIAS, GYRO_BIAS
+from eskf_ros.filter.state.error_state import ACCEL_BIAS, GYRO_BIAS
 from eskf_ros.geodesy.rotation import to_matrix
 from eskf_ros.parameters import from_mapping
 from eskf_ros.simulate.scenario import SCENARIOS, Recording, simulate

@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 from eskf_ros.filter.measurements import nhc, wheel
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state import augmented_states
-from eskf_ros.filter.state.layout import ERROR_SIZE, NOWHERE, Stream, Verdict
+from eskf_ros.filter.state.enums import Stream, Verdict
+from eskf_ros.filter.state.error_state import ERROR_SIZE, NOWHERE
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.parameters import from_mapping
 from eskf_ros.simulate.episodes import WheelSlip

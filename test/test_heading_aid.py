@@ -18,7 +18,8 @@ from eskf_ros.bags import Batch, message_dtype
 from eskf_ros.filter.measurements import heading
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state import augmented_states
-from eskf_ros.filter.state.layout import ERROR_SIZE, Status, Stream, Verdict
+from eskf_ros.filter.state.enums import Status, Stream, Verdict
+from eskf_ros.filter.state.error_state import ERROR_SIZE
 from eskf_ros.inputs.table import INPUTS
 from eskf_ros.simulate.dual_antenna import DualAntenna
 from eskf_ros.simulate.recording import Recording

@@ -17,7 +17,8 @@ from test_aiding import geodetic_of, local_axes_in_map
 
 from eskf_ros.filter.measurements import mag
 from eskf_ros.filter.state import augmented_states
-from eskf_ros.filter.state.layout import ERROR_SIZE, Status, Stream, Verdict
+from eskf_ros.filter.state.enums import Status, Stream, Verdict
+from eskf_ros.filter.state.error_state import ERROR_SIZE
 from eskf_ros.geodesy import magnetic_model
 from eskf_ros.geodesy.magnetic_model import FieldUnknown, field_at
 from eskf_ros.simulate.dual_antenna import DualAntenna

@@ -11,10 +11,13 @@ from hypothesis import strategies as st
 from kernels import core
 
 from eskf_ros.filter.fuse import offer
+from eskf_ros.filter.history.records import AID, RECORD
 from eskf_ros.filter.history.timeline import EARLY_AIDS
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.filter.output.global_odometry import ODOMETRY
 from eskf_ros.filter.settings import settings_from
-from eskf_ros.filter.state.layout import AID, ODOMETRY, RECORD, Status, Stream, Verdict, allocate
+from eskf_ros.filter.state.enums import Status, Stream, Verdict
+from eskf_ros.filter.state.memory import allocate
 from eskf_ros.geodesy.earth import ecef_to_geodetic
 from eskf_ros.gnss.measurements import MEASURED_SIGNAL
 from eskf_ros.gnss.ranges import CODE_VALID

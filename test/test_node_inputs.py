@@ -11,7 +11,7 @@ from ros_process import needs_ros
 from eskf_ros.bags import Batch, StringTable, decode, encode, message_dtype
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.settings import intakes_from
-from eskf_ros.filter.state.layout import Stream, Verdict
+from eskf_ros.filter.state.enums import Stream, Verdict
 from eskf_ros.gnss.cloud import fields_of, write_epoch
 from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, SATELLITE_KNOWN, allocate_ranges
 from eskf_ros.gnss.ranges import Status as RangeStatus

@@ -16,7 +16,7 @@ from scipy.stats import chi2
 from test_node_inside import Drive, Inside
 
 from eskf_ros.bags import POINT_CLOUD, StringTable, cloud_messages, decode, encode, open_bag
-from eskf_ros.filter.state.layout import Verdict
+from eskf_ros.filter.state.enums import Verdict
 from eskf_ros.filter.tight.signal import satellite_of
 from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.replay.main import main as replay

@@ -15,13 +15,16 @@ from hypothesis import strategies as st
 from kernels import USUAL_STDS, copy_of, core, make_settings, make_state, make_work, random_covariance, random_state
 from numpy.typing import NDArray
 
+from eskf_ros.filter.history.records import AID
 from eskf_ros.filter.integrity.recovery import reset_for_new_solution
 from eskf_ros.filter.measurements import gnss_position
 from eskf_ros.filter.measurements.kalman_update import update
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.predict import step
 from eskf_ros.filter.state import augmented_states
-from eskf_ros.filter.state.layout import AID, ERROR_SIZE, NOWHERE, Stream, Verdict, allocate
+from eskf_ros.filter.state.enums import Stream, Verdict
+from eskf_ros.filter.state.error_state import ERROR_SIZE, NOWHERE
+from eskf_ros.filter.state.memory import allocate
 from eskf_ros.parameters import from_mapping
 from eskf_ros.simulate.scenario import Recording, simulate
 

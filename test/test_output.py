@@ -18,8 +18,10 @@ from kernels import (
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from eskf_ros.filter.output.global_odometry import status_of, write_odometry
-from eskf_ros.filter.state.layout import LOCAL, ODOMETRY, Status, allocate
+from eskf_ros.filter.output.global_odometry import ODOMETRY, status_of, write_odometry
+from eskf_ros.filter.output.local_odometry import LOCAL
+from eskf_ros.filter.state.enums import Status
+from eskf_ros.filter.state.memory import allocate
 from eskf_ros.filter.state.time import NEVER
 
 Array = NDArray[np.float64]

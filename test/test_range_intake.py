@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.filter.state.layout import Stream, Verdict
+from eskf_ros.filter.state.enums import Stream, Verdict
 from eskf_ros.gnss.cloud import write_epoch
 from eskf_ros.gnss.ephemeris import Broadcast, Message
 from eskf_ros.gnss.ephemeris_cloud import write_ephemerides

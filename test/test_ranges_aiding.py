@@ -10,8 +10,10 @@ import pytest
 from kernels import copy_of, make_settings, make_work, random_covariance, random_state, to_rotation, with_error
 from numpy.typing import NDArray
 
+from eskf_ros.filter.history.records import PAYLOAD_SIZE
 from eskf_ros.filter.state import augmented_states
-from eskf_ros.filter.state.layout import ERROR_SIZE, INTER_SYSTEM, NOWHERE, PAYLOAD_SIZE, Stream
+from eskf_ros.filter.state.enums import Stream
+from eskf_ros.filter.state.error_state import ERROR_SIZE, INTER_SYSTEM, NOWHERE
 from eskf_ros.filter.tight import pseudorange, range_rate
 from eskf_ros.filter.tight import signal as signal_place
 from eskf_ros.filter.tight.signal import FLAGS, MEASURED, SATELLITE, SATELLITE_VELOCITY, STD, source_of

@@ -26,7 +26,7 @@ from eskf_ros import parameters
 from eskf_ros.bags import BagWriter, open_bag
 from eskf_ros.compiled import COMPILED
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.filter.state.layout import Status
+from eskf_ros.filter.state.enums import Status
 from eskf_ros.replay.main import main
 from eskf_ros.replay.tum_writer import tum_text
 
@@ -407,7 +407,7 @@ def test_truth_as_fixes_of_the_antenna_and_in_the_map(tmp_path: Path, recording:
 
 def test_the_covariance_of_the_truth_counts() -> None:
     """e' (P + R)^-1 e by hand: P = 9, R = 16 and an error of 5 m east give 25 / 25."""
-    from eskf_ros.filter.state.layout import ODOMETRY
+    from eskf_ros.filter.output.global_odometry import ODOMETRY
     from eskf_ros.geodesy.map_frame import MapFrame
     from eskf_ros.replay.truth import EPOCH, compare
 

@@ -12,7 +12,7 @@ import pytest
 from gnss_observation_text import observation_text
 
 from eskf_ros.bags import BagWriter, open_bag
-from eskf_ros.filter.state.layout import Stream
+from eskf_ros.filter.state.enums import Stream
 from eskf_ros.replay.main import main
 from eskf_ros.simulate.main import main as simulate_main
 from eskf_ros.simulate.range_receiver import RangeReceiver

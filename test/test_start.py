@@ -12,7 +12,8 @@ from kernels import make_settings
 from monte_carlo import Run, feed, nees
 from scipy.stats import chi2
 
-from eskf_ros.filter.state.layout import Status, blank_state
+from eskf_ros.filter.state.enums import Status
+from eskf_ros.filter.state.layout import blank_state
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity import residual_motion
 from eskf_ros.simulate.recording import Recording

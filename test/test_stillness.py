@@ -12,9 +12,11 @@ from kernels import copy_of, core, make_settings, make_state, make_work, random_
 from monte_carlo import BLOCKS, nees
 from numpy.typing import NDArray
 
+from eskf_ros.filter.history.records import AID, RECORD
 from eskf_ros.filter.measurements.kalman_update import update
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.filter.state.layout import AID, CONSTRAINT_INTERVAL, RECORD, Stream, Verdict, allocate
+from eskf_ros.filter.state.enums import CONSTRAINT_INTERVAL, Stream, Verdict
+from eskf_ros.filter.state.memory import allocate
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity.detector import learn_from_block, update_rest_evidence
 from eskf_ros.parameters import from_mapping

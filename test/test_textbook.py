@@ -17,7 +17,7 @@ from scipy.stats import chi2
 from eskf_ros.filter.inertial.strapdown import gravity_map
 from eskf_ros.filter.measurements import gnss_position, gnss_velocity
 from eskf_ros.filter.measurements.kalman_update import update
-from eskf_ros.filter.state.layout import Stream, Verdict
+from eskf_ros.filter.state.enums import Stream, Verdict
 
 FACING_NORTH, FACING_EAST = (Rotation.from_euler("z", degrees, degrees=True) for degrees in (90.0, 0.0))
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.filter.state.layout import Status, Verdict
+from eskf_ros.filter.state.enums import Status, Verdict
 from eskf_ros.parameters import from_mapping
 from eskf_ros.simulate.scenario import Recording, simulate
 

@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from eskf_ros.filter.measurements.kalman_update import inject, invert_positive, update
-from eskf_ros.filter.state.layout import Stream, Verdict
+from eskf_ros.filter.state.enums import Stream, Verdict
 
 Array = NDArray[np.float64]
 

@@ -29,7 +29,7 @@ from eskf_ros.filter.measurements import (
 from eskf_ros.filter.measurements.kalman_update import update
 from eskf_ros.filter.output.local_odometry import note_jump
 from eskf_ros.filter.state.augmented_states import join
-from eskf_ros.filter.state.layout import SENSOR_STREAMS, Stream, Verdict
+from eskf_ros.filter.state.enums import SENSOR_STREAMS, Stream, Verdict
 from eskf_ros.filter.stationarity.detector import update_rest_evidence, watch_wheels
 from eskf_ros.filter.stationarity.static_window import update_evidence_from_fix, update_evidence_from_velocity
 

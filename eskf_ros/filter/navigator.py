@@ -14,6 +14,7 @@ from eskf_ros.filter.alignment.first_fix import place
 from eskf_ros.filter.alignment.heading_search import forget_search
 from eskf_ros.filter.alignment.warm_start import Memory, recall
 from eskf_ros.filter.history.admission import ABSENT, admit
+from eskf_ros.filter.history.records import AID, IMU, RECORD, TIMELINE
 from eskf_ros.filter.history.timeline import (
     CHECKPOINT_SPACING,
     EARLY_AIDS,
@@ -31,27 +32,13 @@ from eskf_ros.filter.integrity.receiver_monitor import aid_complaints
 from eskf_ros.filter.integrity.recovery import phase_of
 from eskf_ros.filter.loop import advance
 from eskf_ros.filter.measurements import heading, mag
-from eskf_ros.filter.output.global_odometry import status_of, write_odometry
-from eskf_ros.filter.output.local_odometry import note_jump
+from eskf_ros.filter.output.global_odometry import ODOMETRY, status_of, write_odometry
+from eskf_ros.filter.output.local_odometry import LOCAL, note_jump
 from eskf_ros.filter.settings import UNKNOWN_ANGLE_VARIANCE, intakes_from, settings_from
-from eskf_ros.filter.state.layout import (
-    AID,
-    ERROR_SIZE,
-    IMU,
-    INTER_SYSTEM,
-    LOCAL,
-    ODOMETRY,
-    RECORD,
-    STATE,
-    TIMELINE,
-    WORK,
-    Phase,
-    Status,
-    Stream,
-    Verdict,
-    allocate,
-    blank_state,
-)
+from eskf_ros.filter.state.enums import Phase, Status, Stream, Verdict
+from eskf_ros.filter.state.error_state import ERROR_SIZE, INTER_SYSTEM
+from eskf_ros.filter.state.layout import STATE, WORK, blank_state
+from eskf_ros.filter.state.memory import allocate
 from eskf_ros.filter.state.time import NEVER, SECOND
 from eskf_ros.filter.tight.epoch import offer_signals
 from eskf_ros.geodesy.earth import east_north_up_to_ecef, ecef_to_geodetic

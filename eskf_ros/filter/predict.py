@@ -7,7 +7,7 @@ from eskf_ros.filter.alignment.heading_search import predict_search
 from eskf_ros.filter.inertial.covariance import add_noise, propagate_covariance
 from eskf_ros.filter.inertial.strapdown import propagate_nominal_state
 from eskf_ros.filter.state import augmented_states
-from eskf_ros.filter.state.layout import ERROR_SIZE
+from eskf_ros.filter.state.error_state import ERROR_SIZE
 from eskf_ros.filter.state.time import SECOND
 from eskf_ros.geodesy.rotation import dot
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from eskf_ros.bags import POINT_CLOUD, Batch
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.filter.state.layout import Stream
+from eskf_ros.filter.state.enums import Stream
 from eskf_ros.inputs.epochs import RangeIntake
 from eskf_ros.parameters import Parameters
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from eskf_ros.bags import Batch
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.filter.state.layout import ODOMETRY, Status
+from eskf_ros.filter.output.global_odometry import ODOMETRY
+from eskf_ros.filter.state.enums import Status
 from eskf_ros.inputs.epochs import RangeIntake
 from eskf_ros.inputs.table import Input
 from eskf_ros.replay.topics import TopicNames

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.bags import BagWriter, message_dtype
-from eskf_ros.filter.state.layout import STREAM_NAMES, Stream, Verdict
+from eskf_ros.filter.state.enums import STREAM_NAMES, Stream, Verdict
 from eskf_ros.filter.tight.signal import name_of
 from eskf_ros.geodesy.map_frame import MapFrame, to_geodetic
 from eskf_ros.parameters import Frames

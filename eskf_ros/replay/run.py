@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from eskf_ros.bags import BagReader, Batch, open_bag
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.filter.state.layout import ODOMETRY
+from eskf_ros.filter.output.global_odometry import ODOMETRY
 from eskf_ros.gnss.rinex import RinexError
 from eskf_ros.inputs.epochs import RangeIntake
 from eskf_ros.inputs.rinex_as_messages import RangesError, merged, read_beside

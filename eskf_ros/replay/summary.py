@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.filter.state.layout import STREAM_NAMES, Status, Stream, Verdict
+from eskf_ros.filter.state.enums import STREAM_NAMES, Status, Stream, Verdict
 from eskf_ros.geodesy.map_frame import MapFrame, east_north_up_to_ecef, to_geodetic
 from eskf_ros.inputs.epochs import RangeIntake
 from eskf_ros.inputs.table import Input

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.bags import BagReader, Batch
-from eskf_ros.filter.state.layout import Stream
+from eskf_ros.filter.state.enums import Stream
 from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.inputs.table import FIX, ODOMETRY, RANGES, TWIST, Input, inputs_of, uses_ranges
 from eskf_ros.parameters import Parameters, Topics

@@ -12,7 +12,8 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from eskf_ros.filter.state.layout import SOURCES, STREAM_NAMES, Phase, Status, Stream, Verdict
+from eskf_ros.filter.state.enums import STREAM_NAMES, Phase, Status, Stream, Verdict
+from eskf_ros.filter.state.error_state import SOURCES
 from eskf_ros.filter.tight.signal import name_of
 from eskf_ros.gnss.signals import BEIDOU_3, Gnss
 from eskf_ros.ros_node.clocks import SECOND, StampMonitor, clock_complaints

@@ -11,7 +11,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from sensor_msgs.msg import NavSatFix, NavSatStatus
 
-from eskf_ros.filter.state.layout import STREAM_NAMES, Stream, Verdict
+from eskf_ros.filter.state.enums import STREAM_NAMES, Stream, Verdict
 from eskf_ros.filter.tight.signal import name_of
 from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.gnss.point_solution import PointSolution, SolutionStatus

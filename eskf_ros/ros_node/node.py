@@ -23,7 +23,7 @@ from std_srvs.srv import Trigger
 from eskf_ros.compiled import sentence_on_compiling, while_compiling
 from eskf_ros.filter.alignment.warm_start import Memory
 from eskf_ros.filter.navigator import ORIENTATION_SHARE, Navigator
-from eskf_ros.filter.state.layout import STREAM_NAMES, Status, Stream, Verdict
+from eskf_ros.filter.state.enums import STREAM_NAMES, Status, Stream, Verdict
 from eskf_ros.gnss.rinex import RinexError
 from eskf_ros.inputs.epochs import RangeIntake
 from eskf_ros.inputs.table import Input, uses_ranges

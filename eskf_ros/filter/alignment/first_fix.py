@@ -15,7 +15,7 @@ from eskf_ros.filter.alignment.heading import reset_heading
 from eskf_ros.filter.alignment.heading_search import forget_search
 from eskf_ros.filter.inertial.navigation_frame import local_up, set_datum, shortest_turn, turn_attitude
 from eskf_ros.filter.measurements.gnss_position import position_of_fix
-from eskf_ros.filter.state.layout import ERROR_CAPACITY, POSITION, VELOCITY
+from eskf_ros.filter.state.error_state import ERROR_CAPACITY, POSITION, VELOCITY
 from eskf_ros.geodesy.rotation import rotate, rotate_back, to_matrix
 
 START_POSITION_STD = 1000.0

@@ -16,7 +16,8 @@ from eskf_ros.filter.inertial.navigation_frame import (
 )
 from eskf_ros.filter.measurements.gnss_position import position_of_fix
 from eskf_ros.filter.measurements.jacobians import set_east_north_up_covariance
-from eskf_ros.filter.state.layout import ATTITUDE, VELOCITY, Stream
+from eskf_ros.filter.state.enums import Stream
+from eskf_ros.filter.state.error_state import ATTITUDE, VELOCITY
 from eskf_ros.geodesy.earth import east_north_up_to_ecef, geodetic_to_ecef
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix, wrapped
 

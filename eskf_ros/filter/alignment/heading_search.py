@@ -19,9 +19,12 @@ from __future__ import annotations
 import math
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.state.layout import ACCEL_BIAS, GYRO_BIAS, SEARCH_SIZE
+from eskf_ros.filter.state.error_state import ACCEL_BIAS, GYRO_BIAS
 from eskf_ros.geodesy.earth import STANDARD_GRAVITY
 from eskf_ros.geodesy.rotation import rotate
+
+SEARCH_SIZE = 10
+"""States of the search for the heading (see ``heading_search``)."""
 
 COSINE = 4
 TILT = 6

@@ -14,7 +14,8 @@ from eskf_ros.filter.alignment.first_fix import START_VELOCITY_STD
 from eskf_ros.filter.alignment.heading import reset_heading
 from eskf_ros.filter.alignment.heading_search import turn_found
 from eskf_ros.filter.inertial.navigation_frame import heading_of
-from eskf_ros.filter.state.layout import ERROR_SIZE, GYRO_BIAS, VELOCITY, Stream
+from eskf_ros.filter.state.enums import Stream
+from eskf_ros.filter.state.error_state import ERROR_SIZE, GYRO_BIAS, VELOCITY
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.geodesy.rotation import wrapped
 

@@ -9,7 +9,7 @@ from eskf_ros.filter.alignment.heading import reset_heading
 from eskf_ros.filter.alignment.heading_search import note_level
 from eskf_ros.filter.alignment.warm_start import do_biases_hold
 from eskf_ros.filter.inertial.navigation_frame import heading_of, local_up, shortest_turn, turn_attitude
-from eskf_ros.filter.state.layout import ACCEL_BIAS, ATTITUDE, ERROR_CAPACITY, ERROR_SIZE, GYRO_BIAS
+from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_CAPACITY, ERROR_SIZE, GYRO_BIAS
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity.residual_motion import can_be_bias, is_moving, note_sway
 from eskf_ros.filter.stationarity.static_window import Window

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.state.layout import Verdict
+from eskf_ros.filter.state.enums import Verdict
 
 VARIANCES = (3, 6, 8)
 """Where the variances of the three values are in the payload."""

@@ -18,7 +18,8 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.state.layout import CONSTRAINT_INTERVAL, SENSOR_STREAMS, Verdict, allocate
+from eskf_ros.filter.state.enums import CONSTRAINT_INTERVAL, SENSOR_STREAMS, Verdict
+from eskf_ros.filter.state.memory import allocate
 from eskf_ros.filter.state.time import NEVER
 
 EARLY_AIDS = 4096

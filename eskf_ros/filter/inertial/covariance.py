@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.state.layout import ACCEL_BIAS, ERROR_SIZE
+from eskf_ros.filter.state.error_state import ACCEL_BIAS, ERROR_SIZE
 from eskf_ros.geodesy.earth import SEMI_MAJOR_AXIS
 from eskf_ros.geodesy.rotation import rotate
 

@@ -7,7 +7,7 @@ import math
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.covariance import transform_error
 from eskf_ros.filter.inertial.strapdown import gravity_map
-from eskf_ros.filter.state.layout import ATTITUDE, ERROR_SIZE, POSITION, VELOCITY
+from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, POSITION, VELOCITY
 from eskf_ros.geodesy.earth import EARTH_RATE, east_north_up_to_ecef, ecef_to_geodetic, geodetic_to_ecef
 from eskf_ros.geodesy.rotation import (
     cross,

@@ -13,7 +13,8 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.measurements.gnss_position import noise_factor
-from eskf_ros.filter.state.layout import POSITION, SOURCES, Stream
+from eskf_ros.filter.state.enums import Stream
+from eskf_ros.filter.state.error_state import POSITION, SOURCES
 from eskf_ros.filter.state.time import NEVER
 
 SHORTEST_PATIENCE = 1_000_000_000

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.state.layout import Stream
+from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity.residual_motion import can_be_bias
 from eskf_ros.geodesy.earth import STANDARD_GRAVITY

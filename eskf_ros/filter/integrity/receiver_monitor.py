@@ -24,17 +24,8 @@ from eskf_ros.filter.inertial.strapdown import gravity_map
 from eskf_ros.filter.integrity.fix_tracker import is_led
 from eskf_ros.filter.measurements.gnss_position import noise_factor
 from eskf_ros.filter.measurements.gnss_velocity import predict
-from eskf_ros.filter.state.layout import (
-    ACCEL_BIAS,
-    ATTITUDE,
-    ERROR_SIZE,
-    GYRO_BIAS,
-    POSITION,
-    SOURCES,
-    VELOCITY,
-    Stream,
-    Verdict,
-)
+from eskf_ros.filter.state.enums import Stream, Verdict
+from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, SOURCES, VELOCITY
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.geodesy.rotation import cross, rotate, to_matrix
 

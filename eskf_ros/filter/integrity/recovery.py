@@ -27,16 +27,8 @@ from eskf_ros.filter.integrity.fix_tracker import is_contradicted, is_fusing, is
 from eskf_ros.filter.integrity.restart import restart
 from eskf_ros.filter.measurements.kalman_update import project, update
 from eskf_ros.filter.state.augmented_states import reset_augmented
-from eskf_ros.filter.state.layout import (
-    ERROR_CAPACITY,
-    POSITION,
-    SENSOR_STREAMS,
-    SOURCES,
-    VELOCITY,
-    Phase,
-    Stream,
-    Verdict,
-)
+from eskf_ros.filter.state.enums import SENSOR_STREAMS, Phase, Stream, Verdict
+from eskf_ros.filter.state.error_state import ERROR_CAPACITY, POSITION, SOURCES, VELOCITY
 from eskf_ros.filter.state.time import NEVER
 
 MEMBERS = 5

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.measurements.jacobians import clear
-from eskf_ros.filter.state.layout import ATTITUDE, ERROR_SIZE, POSITION
+from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, POSITION
 from eskf_ros.geodesy.earth import east_north_up_to_ecef, ecef_to_geodetic
 from eskf_ros.geodesy.rotation import cross, rotate, rotate_back, to_matrix
 

@@ -13,7 +13,7 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.measurements.jacobians import clear, set_east_north_up_covariance, set_identity, set_minus_cross
-from eskf_ros.filter.state.layout import ATTITUDE, ERROR_SIZE, POSITION
+from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, POSITION
 from eskf_ros.geodesy.earth import east_north_up_to_ecef, geodetic_to_ecef
 from eskf_ros.geodesy.rotation import rotate, rotate_back, to_matrix
 

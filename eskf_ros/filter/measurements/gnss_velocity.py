@@ -10,7 +10,7 @@ from __future__ import annotations
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import body_rate, local_east_north_up_to_ecef
 from eskf_ros.filter.measurements.jacobians import clear, set_east_north_up_covariance, set_identity, set_minus_cross
-from eskf_ros.filter.state.layout import ATTITUDE, GYRO_BIAS, VELOCITY
+from eskf_ros.filter.state.error_state import ATTITUDE, GYRO_BIAS, VELOCITY
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix
 
 SIZE = 3

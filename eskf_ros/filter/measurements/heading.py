@@ -18,7 +18,7 @@ import math
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import local_east_north_up_to_ecef
 from eskf_ros.filter.measurements.jacobians import azimuth_change, clear, set_attitude_row, to_local
-from eskf_ros.filter.state.layout import ERROR_SIZE
+from eskf_ros.filter.state.error_state import ERROR_SIZE
 from eskf_ros.geodesy.rotation import wrapped
 
 IMU_ORIENTATION = 1

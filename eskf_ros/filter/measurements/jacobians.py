@@ -6,7 +6,7 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.strapdown import gravity_map
-from eskf_ros.filter.state.layout import ATTITUDE, ERROR_CAPACITY, ERROR_SIZE, GYRO_BIAS, VELOCITY
+from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_CAPACITY, ERROR_SIZE, GYRO_BIAS, VELOCITY
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix
 
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.covariance import transform_error
-from eskf_ros.filter.state.layout import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, VELOCITY, Verdict
+from eskf_ros.filter.state.enums import Verdict
+from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, VELOCITY
 from eskf_ros.geodesy.rotation import from_rotation_vector, left_jacobian, multiply, normalized
 
 

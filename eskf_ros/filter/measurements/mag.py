@@ -19,7 +19,8 @@ import math
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import local_east_north_up_to_ecef
 from eskf_ros.filter.measurements.jacobians import clear, set_attitude_row, to_local
-from eskf_ros.filter.state.layout import ERROR_SIZE, Verdict
+from eskf_ros.filter.state.enums import Verdict
+from eskf_ros.filter.state.error_state import ERROR_SIZE
 from eskf_ros.geodesy.rotation import dot, rotate, rotate_back, to_matrix, wrapped
 
 WEAKEST_LEVEL = 2.0e-6

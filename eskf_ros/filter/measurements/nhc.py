@@ -28,7 +28,7 @@ from eskf_ros.filter.measurements.jacobians import (
     set_point_velocity_row,
     vehicle_axes,
 )
-from eskf_ros.filter.state.layout import ATTITUDE
+from eskf_ros.filter.state.error_state import ATTITUDE
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity.detector import has_block, mean_force
 from eskf_ros.geodesy.rotation import cross, dot, to_matrix

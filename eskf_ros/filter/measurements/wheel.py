@@ -27,7 +27,7 @@ from eskf_ros.filter.measurements.jacobians import (
     set_point_velocity_row,
     vehicle_axes,
 )
-from eskf_ros.filter.state.layout import ATTITUDE, ERROR_SIZE, GYRO_BIAS
+from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, GYRO_BIAS
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.geodesy.rotation import cross, dot, rotate, to_matrix
 

@@ -15,7 +15,8 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.measurements.jacobians import clear, set_identity
-from eskf_ros.filter.state.layout import ATTITUDE, CONSTRAINT_INTERVAL, GYRO_BIAS
+from eskf_ros.filter.state.enums import CONSTRAINT_INTERVAL
+from eskf_ros.filter.state.error_state import ATTITUDE, GYRO_BIAS
 from eskf_ros.filter.stationarity.detector import is_resting, mean_rate
 from eskf_ros.geodesy.rotation import cross, rotate_back, to_matrix
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.measurements.jacobians import clear, set_identity
-from eskf_ros.filter.state.layout import VELOCITY
+from eskf_ros.filter.state.error_state import VELOCITY
 from eskf_ros.filter.stationarity.detector import is_resting
 
 SIZE = 3

@@ -4,12 +4,44 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.levelling import UNKNOWN_SPEED
 from eskf_ros.filter.inertial.navigation_frame import body_rate, heading_of
-from eskf_ros.filter.state.layout import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, VELOCITY, Status
+from eskf_ros.filter.state.enums import Status
+from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, VELOCITY
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.geodesy.rotation import cross, from_matrix, from_rotation_vector, multiply, rotate, rotate_back, to_matrix
+
+ODOMETRY = np.dtype(
+    [
+        ("stamp", "i8"),
+        ("status", "i4"),
+        ("position_known", "?"),
+        ("heading_known", "?"),
+        ("position_map", "f8", (3,)),
+        ("attitude_body_to_map", "f8", (4,)),
+        ("position_odom", "f8", (3,)),
+        ("attitude_body_to_odom", "f8", (4,)),
+        ("local_position_variance", "f8"),
+        ("local_heading_variance", "f8"),
+        ("velocity_map", "f8", (3,)),
+        ("velocity_body", "f8", (3,)),
+        ("angular_rate_body", "f8", (3,)),
+        ("pose_covariance", "f8", (6, 6)),
+        ("twist_covariance", "f8", (6, 6)),
+        ("accel_bias", "f8", (3,)),
+        ("gyro_bias", "f8", (3,)),
+        ("accel_bias_std", "f8", (3,)),
+        ("gyro_bias_std", "f8", (3,)),
+    ],
+    align=True,
+)
+"""What is published for one IMU sample: pose and twist of base_link (here "body" is base_link), biases in IMU axes.
+
+``map`` pose: the best estimate. ``odom`` pose: without jumps (see ``local``).
+"""
 
 SHORTEST_COAST = 1_000_000_000
 LONGEST_WAIT = 3_000_000_000

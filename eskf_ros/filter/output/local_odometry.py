@@ -11,12 +11,26 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.levelling import UNKNOWN_SPEED
 from eskf_ros.filter.inertial.navigation_frame import heading_of
-from eskf_ros.filter.state.layout import GYRO_BIAS, VELOCITY
+from eskf_ros.filter.state.error_state import GYRO_BIAS, VELOCITY
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.geodesy.rotation import wrapped
+
+LOCAL = np.dtype(
+    [
+        ("started", "i8"),
+        ("position", "f8", (3,)),
+        ("heading", "f8"),
+        ("position_variance", "f8"),
+        ("heading_variance", "f8"),
+    ],
+    align=True,
+)
+"""Pose of the IMU in `odom` (m, rad) and the variances it has gathered since the start (per axis)."""
 
 STILL_SPEED = 0.05
 """Speed (m/s) that a robot at rest may have without anybody noticing."""

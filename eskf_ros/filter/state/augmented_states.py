@@ -10,7 +10,7 @@ does not depend on any of them: their columns of the covariance turn with the co
 from __future__ import annotations
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.state.layout import ERROR_SIZE
+from eskf_ros.filter.state.error_state import ERROR_SIZE
 
 
 @njit

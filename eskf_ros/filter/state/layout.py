@@ -9,150 +9,21 @@ Body axes are the axes of the IMU and the body origin is the IMU: biases, noise 
 
 from __future__ import annotations
 
-from enum import IntEnum
-
 import numpy as np
 
-from eskf_ros.compiled import COMPILED
+from eskf_ros.filter.alignment.heading_search import SEARCH_SIZE
+from eskf_ros.filter.state.enums import SENSOR_STREAMS, Stream
+from eskf_ros.filter.state.error_state import (
+    ACCEL_BIAS,
+    ERROR_CAPACITY,
+    ERROR_SIZE,
+    OPTIONAL_CAPACITY,
+    OPTIONAL_SIZES,
+    SOURCES,
+)
+from eskf_ros.filter.state.memory import allocate
 from eskf_ros.filter.state.time import NEVER
-from eskf_ros.gnss.signals import BEIDOU_3, Gnss
-
-# Error state: first index of each block of three. These 15 are the core; every robot has them.
-POSITION = 0
-VELOCITY = 3
-ATTITUDE = 6
-ACCEL_BIAS = 9
-GYRO_BIAS = 12
-ERROR_SIZE = 15
-
-OPTIONAL_SIZES = {
-    "position_error": 3,
-    "mounting": 2,
-    "wheel_scale": 1,
-    "clock": 2,
-    "inter_system": 6,
-    "heading_offset": 1,
-    "baro_offset": 1,
-    "baro_scale": 1,
-    "mag_error": 1,
-    "magnetic_bias": 3,
-}
-"""Optional errors behind the core, and how many each is: see ``optional``.
-
-``clock``: of the receiver, bias (m) and drift (m/s). ``inter_system``: by what the ranges of a constellation are longer
-than those of GPS (m), in the order of `INTER_SYSTEM`.
-"""
-
-INTER_SYSTEM = (Gnss.GALILEO, BEIDOU_3, Gnss.GLONASS, Gnss.QZSS, Gnss.BEIDOU, Gnss.SBAS)
-"""The constellations but GPS (`gnss.signals.time_group`), the most usual first: a state joins with those before it."""
-
-OPTIONAL_CAPACITY = sum(OPTIONAL_SIZES.values())
-ERROR_CAPACITY = ERROR_SIZE + OPTIONAL_CAPACITY
-
-NOWHERE = ERROR_CAPACITY
-"""The place of an optional error that is switched off: behind every error there can be."""
-
-SOURCES = 2
-"""GNSS receivers with antennas of their own, by their index."""
-
-SEARCH_SIZE = 10
-"""States of the search for the heading (see ``heading_search``)."""
-
-
-class Status(IntEnum):
-    """What the estimator has, in the order in which it gets it.
-
-    COASTING: no position was accepted for a while. DEGRADED: fixes come and contradict the estimate. FAULT: the
-    estimate is not finite or a variance negative, only a reset helps.
-    """
-
-    WAITING_IMU = 0
-    LEVELLING = 1
-    WAITING_FIX = 2
-    WAITING_HEADING = 3
-    ALIGNING = 4
-    GOOD = 5
-    COASTING = 6
-    DEGRADED = 7
-    FAULT = 8
-
-
-class Phase(IntEnum):
-    """What an aid is to the filter (see ``recovery``).
-
-    SUSPICIOUS: the latest measurements were rejected. OUTAGE: none came for a while. REACQUIRING: they come, but none
-    was accepted for a while, or not for long yet. RESET: a short while ago they won over the filter.
-    """
-
-    WAITING = 0
-    FUSING = 1
-    SUSPICIOUS = 2
-    OUTAGE = 3
-    REACQUIRING = 4
-    RESET = 5
-
-
-class Verdict(IntEnum):
-    """What became of an offered measurement (a closed list; files show the names in lower case).
-
-    INACTIVE is for what says nothing at the moment, such as rest while the robot moves: it leaves no record.
-    CONTRADICTED: a position that moves otherwise than the velocity of the same receiver. RESET: it is the last of so
-    many rejected ones that agree with each other that the filter gave in.
-    """
-
-    WAITING = 0
-    FUSED = 1
-    GATE = 2
-    NON_FINITE = 3
-    BAD_COVARIANCE = 4
-    BAD_VALUE = 5
-    BAD_STAMP = 6
-    NO_FIX = 7
-    DUPLICATE = 8
-    BEFORE_ALIGNMENT = 9
-    OUTSIDE_HISTORY = 10
-    DISABLED = 11
-    WEIGHED_DOWN = 12
-    INACTIVE = 13
-    LOW_ELEVATION = 14
-    CONTRADICTED = 15
-    RESET = 16
-
-
-class Stream(IntEnum):
-    """Streams by rank: of several messages with one stamp the lower rank comes first.
-
-    From ZUPT on they are constraints: no sensor sends them, the timeline puts them on a grid of stamps.
-    """
-
-    IMU = 0
-    GNSS_POSITION = 1
-    GNSS_VELOCITY = 2
-    HEADING = 3
-    MAG = 4
-    WHEEL = 5
-    BODY_VELOCITY = 6
-    BARO = 7
-    PSEUDORANGE = 8
-    RANGE_RATE = 9
-    ZUPT = 10
-    ZARU = 11
-    NHC = 12
-
-
-STREAM_NAMES = tuple(stream.name.lower() for stream in Stream)
-
-CONSTRAINTS = (Stream.ZUPT, Stream.ZARU, Stream.NHC)
-
-SENSOR_STREAMS = int(min(CONSTRAINTS))
-"""So many streams, the first by rank, are those of sensors."""
-
-CONSTRAINT_INTERVAL = 1_000_000_000
-"""The grid of the constraints (ns).
-
-What makes them wrong (side slip, a body that sways) lasts for about half as long at the least: closer together they
-would not be independent of each other, and the filter would believe their mean too much.
-"""
+from eskf_ros.filter.tight.epoch import LARGEST_EPOCH
 
 STATE = np.dtype(
     [
@@ -367,75 +238,6 @@ STATE = np.dtype(
 )
 """One state of the estimator: all it knows and all it decides with. Copying it is a checkpoint."""
 
-IMU = np.dtype([("stamp", "i8"), ("specific_force", "f8", (3,)), ("angular_rate", "f8", (3,))], align=True)
-
-PAYLOAD_SIZE = 25
-AID = np.dtype(
-    [
-        ("stamp", "i8"),
-        ("arrival", "i8"),
-        ("stream", "i4"),
-        ("source", "i4"),
-        ("door", "i4"),
-        ("verdict", "i4"),
-        ("dof", "i4"),
-        ("told", "i4"),
-        ("nis", "f8"),
-        ("innovation", "f8", (3,)),
-        ("payload", "f8", (PAYLOAD_SIZE,)),
-    ],
-    align=True,
-)
-"""One offered measurement: what was sent, what became of it, and whether ``take_live`` has told that already.
-
-``source``: which of several receivers it is from. ``payload``: three values, the upper triangle of their covariance by
-rows, and what else the file of the aid says.
-"""
-
-RECORD = np.dtype(
-    [
-        ("stamp", "i8"),
-        ("arrival", "i8"),
-        ("stream", "i4"),
-        ("source", "i4"),
-        ("verdict", "i4"),
-        ("dof", "i4"),
-        ("nis", "f8"),
-        ("innovation", "f8", (3,)),
-    ]
-)
-"""The final record of one offered measurement."""
-
-TIMELINE = np.dtype(
-    [
-        ("imu_count", "i8"),
-        ("aid_count", "i8"),
-        ("checkpoint_count", "i8"),
-        ("since_checkpoint", "i8"),
-        ("recorded", "i8"),
-        ("frontier", "i8"),
-        ("published", "i8"),
-        ("rewind_to", "i8"),
-        ("window", "i8"),
-        ("barrier", "i8"),
-        ("furthest_late", "i8"),
-        ("imu_offered", "i8"),
-        ("imu_duplicate", "i8"),
-        ("imu_late", "i8"),
-        ("imu_bad_value", "i8"),
-        ("imu_bad_stamp", "i8"),
-        ("elsewhere_count", "i8"),
-        ("elsewhere_stamp", "i8"),
-    ],
-    align=True,
-)
-"""Fill levels of the history buffers, the newest IMU stamp, how far back the next advance has to start; counters.
-
-``recorded``: aids at the head of the buffer whose final record was handed out. ``published``: newest stamp for which
-a row was written. ``barrier``: nothing older is accepted. ``furthest_late``: largest lateness (ns) refused.
-``elsewhere_count``: refused samples in a row that follow each other far from the frontier; ``elsewhere_stamp``: the
-last one's stamp.
-"""
 
 SETTINGS = np.dtype(
     [
@@ -521,20 +323,6 @@ switched on. ``NAME_at``: place of an optional error, or
 (unit/rtHz), inverse correlation time (1/s).
 """
 
-LOCAL = np.dtype(
-    [
-        ("started", "i8"),
-        ("position", "f8", (3,)),
-        ("heading", "f8"),
-        ("position_variance", "f8"),
-        ("heading_variance", "f8"),
-    ],
-    align=True,
-)
-"""Pose of the IMU in `odom` (m, rad) and the variances it has gathered since the start (per axis)."""
-
-LARGEST_EPOCH = 256
-"""So many signals of an epoch are looked at together."""
 
 WORK = np.dtype(
     [
@@ -572,42 +360,6 @@ WORK = np.dtype(
 
 ``shared``: covariance of the noise of a measurement with the errors, zero but where an aid says otherwise.
 """
-
-ODOMETRY = np.dtype(
-    [
-        ("stamp", "i8"),
-        ("status", "i4"),
-        ("position_known", "?"),
-        ("heading_known", "?"),
-        ("position_map", "f8", (3,)),
-        ("attitude_body_to_map", "f8", (4,)),
-        ("position_odom", "f8", (3,)),
-        ("attitude_body_to_odom", "f8", (4,)),
-        ("local_position_variance", "f8"),
-        ("local_heading_variance", "f8"),
-        ("velocity_map", "f8", (3,)),
-        ("velocity_body", "f8", (3,)),
-        ("angular_rate_body", "f8", (3,)),
-        ("pose_covariance", "f8", (6, 6)),
-        ("twist_covariance", "f8", (6, 6)),
-        ("accel_bias", "f8", (3,)),
-        ("gyro_bias", "f8", (3,)),
-        ("accel_bias_std", "f8", (3,)),
-        ("gyro_bias_std", "f8", (3,)),
-    ],
-    align=True,
-)
-"""What is published for one IMU sample: pose and twist of base_link (here "body" is base_link), biases in IMU axes.
-
-``map`` pose: the best estimate. ``odom`` pose: without jumps (see ``local``).
-"""
-
-
-def allocate(dtype: np.dtype, count: int = 1) -> np.ndarray:
-    """Return ``count`` zeroed records whose items have attributes, in compiled and in plain code."""
-    memory = np.zeros(count, dtype)
-    # Compiled code reads attributes of any record; plain code only of a recarray, which numba is slow to pass.
-    return memory if COMPILED else memory.view(np.recarray)
 
 
 _EVIDENCE = (

@@ -18,7 +18,8 @@ from __future__ import annotations
 import math
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.state.layout import CONSTRAINT_INTERVAL, SOURCES, VELOCITY, Stream, Verdict
+from eskf_ros.filter.state.enums import CONSTRAINT_INTERVAL, Stream, Verdict
+from eskf_ros.filter.state.error_state import SOURCES, VELOCITY
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity.static_window import update_motion
 from eskf_ros.geodesy.earth import geodetic_to_ecef

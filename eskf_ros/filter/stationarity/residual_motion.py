@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.state.layout import VELOCITY
+from eskf_ros.filter.state.error_state import VELOCITY
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.geodesy.earth import EARTH_RATE
 from eskf_ros.geodesy.rotation import dot

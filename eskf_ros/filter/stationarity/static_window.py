@@ -7,7 +7,7 @@ from enum import IntEnum
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import local_up
-from eskf_ros.filter.state.layout import GYRO_BIAS, SOURCES
+from eskf_ros.filter.state.error_state import GYRO_BIAS, SOURCES
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity.residual_motion import MOVING_SPEED
 from eskf_ros.geodesy.earth import STANDARD_GRAVITY, geodetic_to_ecef

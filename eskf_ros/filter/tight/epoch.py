@@ -30,7 +30,8 @@ from eskf_ros.filter.measurements import mag
 from eskf_ros.filter.measurements.kalman_update import invert_positive, project, update
 from eskf_ros.filter.output.local_odometry import note_jump
 from eskf_ros.filter.state.augmented_states import join, reset_augmented
-from eskf_ros.filter.state.layout import ERROR_SIZE, LARGEST_EPOCH, POSITION, VELOCITY, Stream, Verdict
+from eskf_ros.filter.state.enums import Stream, Verdict
+from eskf_ros.filter.state.error_state import ERROR_SIZE, POSITION, VELOCITY
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity.detector import weigh_speed
 from eskf_ros.filter.stationarity.static_window import (
@@ -61,6 +62,9 @@ from eskf_ros.geodesy.earth import SEMI_MAJOR_AXIS, ecef_to_geodetic
 from eskf_ros.geodesy.rotation import cross, dot, rotate, to_matrix
 from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, Status
 from eskf_ros.gnss.signals import SPEED_OF_LIGHT
+
+LARGEST_EPOCH = 256
+"""So many signals of an epoch are looked at together."""
 
 LARGEST_NUMBER = 1e11
 """Beyond every range, satellite and GPS time (m, m/s, s)."""

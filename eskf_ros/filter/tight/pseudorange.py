@@ -18,7 +18,7 @@ import numpy as np
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.measurements.jacobians import clear
-from eskf_ros.filter.state.layout import ATTITUDE, ERROR_SIZE, INTER_SYSTEM, NOWHERE, POSITION
+from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, INTER_SYSTEM, NOWHERE, POSITION
 from eskf_ros.filter.tight.signal import (
     CARRIER,
     CN0,

@@ -14,7 +14,7 @@ import math
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import body_rate
 from eskf_ros.filter.measurements.jacobians import clear
-from eskf_ros.filter.state.layout import ATTITUDE, GYRO_BIAS, POSITION, VELOCITY
+from eskf_ros.filter.state.error_state import ATTITUDE, GYRO_BIAS, POSITION, VELOCITY
 from eskf_ros.filter.tight.signal import (
     CN0,
     MEASURED,

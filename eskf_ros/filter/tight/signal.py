@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import body_rate
-from eskf_ros.filter.state.layout import ERROR_SIZE
+from eskf_ros.filter.state.error_state import ERROR_SIZE
 from eskf_ros.geodesy.rotation import cross, rotate, rotate_back, to_matrix
 from eskf_ros.gnss.geometry import line_of_sight
 from eskf_ros.gnss.ranges import ALREADY_TURNED
