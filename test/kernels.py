@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter import predict
+from eskf_ros.filter import layout, predict
 from eskf_ros.filter.inertial.navigation_frame import set_datum
 from eskf_ros.filter.loop import take_sample
 from eskf_ros.filter.settings import settings_from
-from eskf_ros.filter.state import layout
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.parameters import from_mapping
 
@@ -61,8 +60,8 @@ def make_state(
         state["attitude"] = to_quaternion(attitude)
     for name in ("level_known", "position_known", "heading_known"):
         state[name] = 1
-    state["stamp"] = state["imu_stamp"] = 0
-    state["imu_interval"] = 0.01
+    state["stamp"] = state["imu"]["stamp"] = 0
+    state["imu"]["interval"] = 0.01
     return state
 
 
@@ -159,8 +158,8 @@ def run_samples(
 
 @njit
 def _run_samples(state, samples, cuts, settings, work):
-    state.imu_stamp = NEVER
-    state.imu_interval = 1e9
+    state.imu.stamp = NEVER
+    state.imu.interval = 1e9
     take_sample(state, samples[0])
     cut = 0
     for k in range(1, len(samples)):

@@ -33,7 +33,7 @@ def payload_of(first: Any, covariance: Array) -> Array:
 
 def geodetic_of(state: Any) -> tuple[float, float, float]:
     """Return latitude, longitude (rad), altitude (m) of the body, by pymap3d."""
-    ecef = state["origin_ecef"] + state["map_to_ecef"] @ state["position_map"]
+    ecef = state["frame"]["origin_ecef"] + state["frame"]["map_to_ecef"] @ state["position_map"]
     latitude, longitude, altitude = pymap3d.ecef2geodetic(*ecef, deg=False)
     return float(latitude), float(longitude), float(altitude)
 
@@ -41,7 +41,7 @@ def geodetic_of(state: Any) -> tuple[float, float, float]:
 def local_axes_in_map(state: Any, latitude: float, longitude: float) -> Array:
     """Return east, north and up at a place as columns in map axes, by pymap3d."""
     columns = [pymap3d.enu2ecefv(*unit, latitude, longitude, deg=False) for unit in np.eye(3)]
-    return np.asarray(state["map_to_ecef"].T @ np.array(columns, dtype=float).T)
+    return np.asarray(state["frame"]["map_to_ecef"].T @ np.array(columns, dtype=float).T)
 
 
 def numerical_jacobian(aid: ModuleType, state: Any, settings: Any) -> Array:
@@ -87,7 +87,7 @@ def test_earth_rate_is_in_the_velocity_jacobian() -> None:
     """A body at rest on the Earth: what is left of the attitude columns is the Earth rate's part alone."""
     state, covariance = example(1, 0.0)
     turn = to_rotation(state["attitude"])
-    state["angular_rate"] = state["gyro_bias"] + turn.inv().apply(state["earth_rate_map"])
+    state["angular_rate"] = state["gyro_bias"] + turn.inv().apply(state["frame"]["earth_rate_map"])
     work = make_work()
     gnss_velocity.linearize(state, payload_of((0.0, 0.0, 0.0), covariance), 0, LONG_ARM, work)
     np.testing.assert_allclose(gnss_velocity.predict(state, 0, LONG_ARM), state["velocity_map"], rtol=0.0, atol=1e-14)
@@ -105,7 +105,7 @@ def test_innovation_of_position(seed: int, far: float) -> None:
     lever_arm = np.array(SETTINGS["lever_arms_body"][0])
     antenna = state["position_map"] + to_rotation(state["attitude"]).apply(lever_arm)
     off = np.array([1.0, -2.0, 2.0])
-    ecef = state["origin_ecef"] + state["map_to_ecef"] @ (antenna + off)
+    ecef = state["frame"]["origin_ecef"] + state["frame"]["map_to_ecef"] @ (antenna + off)
     # pymap3d's inverse is too coarse; one step with its forward function sharpens it.
     geodetic = np.array([float(value) for value in pymap3d.ecef2geodetic(*ecef, deg=False)])
     for _ in range(3):
@@ -124,7 +124,7 @@ def test_innovation_of_velocity(seed: int, far: float) -> None:
     """East, north and up of the place of the robot, not of the datum; the rate is free of bias and of Earth rate."""
     state, covariance = example(seed, far)
     turn = to_rotation(state["attitude"])
-    rate = state["angular_rate"] - state["gyro_bias"] - turn.inv().apply(state["earth_rate_map"])
+    rate = state["angular_rate"] - state["gyro_bias"] - turn.inv().apply(state["frame"]["earth_rate_map"])
     antenna = state["velocity_map"] + turn.apply(np.cross(rate, SETTINGS["lever_arms_body"][0]))
     latitude, longitude, _ = geodetic_of(state)
     off = np.array([0.1, -0.2, 0.3])
@@ -159,7 +159,7 @@ def test_noise_is_turned_to_map_axes(seed: int, far: float) -> None:
     arm = np.array(SETTINGS["lever_arms_body"][0])
     cross = np.array([[0.0, -arm[2], arm[1]], [arm[2], 0.0, -arm[0]], [-arm[1], arm[0], 0.0]])
     sway = to_rotation(state["attitude"]).as_matrix() @ cross
-    rate_variance = SETTINGS["gyro_noise_density"] ** 2 / state["imu_interval"]
+    rate_variance = SETTINGS["gyro_noise_density"] ** 2 / state["imu"]["interval"]
     expected = axes @ covariance @ axes.T + rate_variance * sway @ sway.T
     np.testing.assert_allclose(work["noise"], expected, rtol=0.0, atol=1e-7)
 

@@ -28,9 +28,9 @@ from eskf_ros.filter.history.records import AID
 from eskf_ros.filter.inertial import navigation_frame
 from eskf_ros.filter.inertial.strapdown import gravity_map
 from eskf_ros.filter.integrity.restart import restart
+from eskf_ros.filter.layout import blank_state
 from eskf_ros.filter.loop import update_rest
 from eskf_ros.filter.measurements import gnss_position
-from eskf_ros.filter.state.layout import blank_state
 from eskf_ros.filter.state.memory import allocate
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity import static_window
@@ -68,7 +68,9 @@ def fresh(datum: tuple[float, float, float] | None = DATUM) -> Any:
 def at_rest(state: Any, attitude: Rotation, accel_bias: Any, gyro_bias: Any) -> tuple[Array, Array]:
     """Return the mean readings of an IMU that lies still with this attitude."""
     gravity = np.array(gravity_map(state, (0.0, 0.0, 0.0)))
-    turning = np.array(state["earth_rate_map"]) if state["datum_known"] else np.array([0.0, 4.8e-5, 5.5e-5])
+    turning = (
+        np.array(state["frame"]["earth_rate_map"]) if state["frame"]["datum_known"] else np.array([0.0, 4.8e-5, 5.5e-5])
+    )
     return attitude.inv().apply(-gravity) + accel_bias, attitude.inv().apply(turning) + gyro_bias
 
 
@@ -188,7 +190,7 @@ def test_gyro_bias_is_the_bayesian_posterior(seed: int, case: str) -> None:
     noise = settings["gyro_noise_density"] ** 2 / duration + settings["gyro_bias_random_walk"] ** 2 * duration / 3.0
     to_body = to_rotation(state["attitude"]).inv().as_matrix()
     up = np.array(navigation_frame.local_up(state))
-    earth = np.array(state["earth_rate_map"])
+    earth = np.array(state["frame"]["earth_rate_map"])
     across = np.eye(3) - np.outer(up, up)
     # A rate of known size and unknown direction has half of its square on each of two axes.
     square = (across @ earth) @ (across @ earth)
@@ -307,9 +309,9 @@ def driving(velocity: Any, velocity_covariance: Any, heading: float | None = Non
     core(state)[8, 8] = math.pi**2
     core(state)[3:5, 3:5] = velocity_covariance
     turn = (math.atan2(velocity[1], velocity[0]) if heading is None else heading) - 1.0
-    state["search_started"] = 1
-    state["search"][4:6] = math.cos(turn), math.sin(turn)
-    state["search_covariance"][4:6, 4:6] = search_std**2 * np.eye(2)
+    state["search"]["started"] = 1
+    state["search"]["estimate"][4:6] = math.cos(turn), math.sin(turn)
+    state["search"]["covariance"][4:6, 4:6] = search_std**2 * np.eye(2)
     return state
 
 
@@ -397,8 +399,8 @@ def watch(state: Any, settings: Any, seconds: float, force: Any, rate: Any, shak
 
 def waiting() -> Any:
     state = fresh()
-    state["stamp"] = state["imu_stamp"] = 1_000_000_000
-    state["imu_interval"] = 0.01
+    state["stamp"] = state["imu"]["stamp"] = 1_000_000_000
+    state["imu"]["interval"] = 0.01
     return state
 
 
@@ -451,7 +453,7 @@ def test_a_bias_that_warms_up_is_followed_at_rest() -> None:
     force, rate = at_rest(state, Rotation.identity(), np.zeros(3), bias)
     for second in range(60):
         watch(state, settings, 1.0, force, rate + np.radians(0.1) * second / 60.0)
-    assert state["stamp"] - state["still_stamp"] < 3_000_000_000
+    assert state["stamp"] - state["window"]["still_stamp"] < 3_000_000_000
 
 
 def test_restart_while_standing_still_counts_from_zero() -> None:
@@ -505,13 +507,13 @@ def distrusting(robots: int, std: float, speed: float = 0.0) -> int:
             aid["payload"][:9] = (latitude, longitude, DATUM[2] + up, std**2, 0.0, 0.0, std**2, 0.0, std**2)
             if static_window.update_evidence_from_fix(state, aid):
                 levelling.reset_level_to_moving(state, settings)
-            if state["motion_stamp"] > 0 and state["still_stamp"] == NEVER:
+            if state["window"]["motion_stamp"] > 0 and state["window"]["still_stamp"] == NEVER:
                 found += 1
                 break
             if epoch % 10 == 0:
-                state["still_stamp"] = aid["stamp"]
-                state["anchor_stamp"][:] = state["last_fix_stamp"]
-                state["anchor_ecef"][:] = state["last_fix_ecef"]
+                state["window"]["still_stamp"] = aid["stamp"]
+                state["window"]["anchor_stamp"][:] = state["window"]["last_fix_stamp"]
+                state["window"]["anchor_ecef"][:] = state["window"]["last_fix_ecef"]
     return found
 
 
@@ -535,8 +537,8 @@ def test_first_fix_starts_the_position() -> None:
     level_with(state, *at_rest(state, attitude, np.zeros(3), np.zeros(3)), settings)
     payload = np.array([math.radians(48.0), math.radians(11.0), 500.0, 1.0, 0.0, 0.0, 1.0, 0.0, 4.0])
     first_fix.reset_position_to_fix(state, payload)
-    assert (state["datum_known"], state["position_known"]) == (1, 1)
-    np.testing.assert_array_equal(state["datum"], payload[:3])
+    assert (state["frame"]["datum_known"], state["position_known"]) == (1, 1)
+    np.testing.assert_array_equal(state["frame"]["datum"], payload[:3])
     np.testing.assert_allclose(state["position_map"], 0.0, atol=1e-9)
     # The plumb line at 500 m altitude leans by less than a microradian against the normal of the ellipsoid.
     assert np.linalg.norm(tilt_error(state, attitude)) < 1e-6

@@ -17,9 +17,8 @@ import numpy as np
 import pytest
 from kernels import core
 
-from eskf_ros.filter import fuse, navigator, predict, settings
+from eskf_ros.filter import fuse, layout, navigator, predict, settings
 from eskf_ros.filter.measurements import kalman_update
-from eskf_ros.filter.state import layout
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, GYRO_BIAS
 from eskf_ros.geodesy.rotation import to_matrix
 from eskf_ros.parameters import from_mapping
@@ -163,7 +162,7 @@ class FrozenGain:
         self.settings = settings.settings_from(parameters)[0]
         self.work = layout.allocate(layout.WORK)[0]
         self.sample = layout.allocate(layout.IMU)[0]
-        self.next_imu = int(np.searchsorted(recording.imu_stamp, state["imu_stamp"])) + 1
+        self.next_imu = int(np.searchsorted(recording.imu_stamp, state["imu"]["stamp"])) + 1
         self.next_fix = int(np.searchsorted(recording.fix_stamp, state["stamp"]))
         self.gains: dict[layout.Stream, np.ndarray] = {}
 

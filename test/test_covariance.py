@@ -106,7 +106,7 @@ def applied_to_identity(state: Any, samples: tuple[Any, Any, Any, Any], dt: floa
     strength = float(np.linalg.norm(gravity))
     moving = np.empty((9, 15))
     rows = tuple(tuple(float(value) for value in row) for row in middle.as_matrix())
-    earth_rate = tuples(state["earth_rate_map"])
+    earth_rate = tuples(state["frame"]["earth_rate_map"])
     up = tuples(-gravity / strength)
     kernel.apply_transition(
         np.eye(15), moving, 15, rows, tuples(force), up, strength / SEMI_MAJOR_AXIS, earth_rate, dt, coupling

@@ -51,9 +51,9 @@ def moving(seed: int, settings: Any = SETTINGS) -> Any:
     augmented_states.join(state, settings["reach"][Stream.WHEEL], settings)
     if state["error_size"] > ERROR_SIZE:
         state["optional"][:3] = rng.normal(0.0, (0.1, 0.1, 0.05))
-    state["block_end"] = state["stamp"]
-    state["block_count"], state["block_half_count"] = 100, 50
-    state["block_sum"][:3] = 100 * state["specific_force"]
+    state["rest"]["block_end"] = state["stamp"]
+    state["rest"]["block_count"], state["rest"]["block_half_count"] = 100, 50
+    state["rest"]["block_sum"][:3] = 100 * state["specific_force"]
     return state
 
 
@@ -90,7 +90,7 @@ def velocity_in_vehicle(state: Any, settings: Any, position_base: Any) -> tuple[
     """Velocity of a point of base_link and angular rate, in the axes of the vehicle."""
     imu_to_base = Rotation.from_matrix(settings["imu_to_base"])
     turn = to_rotation(state["attitude"])
-    rate = state["angular_rate"] - state["gyro_bias"] - turn.inv().apply(state["earth_rate_map"])
+    rate = state["angular_rate"] - state["gyro_bias"] - turn.inv().apply(state["frame"]["earth_rate_map"])
     arm = imu_to_base.inv().apply(np.subtract(position_base, MOUNT["imu__mount_position"]))
     velocity = turn.inv().apply(state["velocity_map"]) + np.cross(rate, arm)
     to_vehicle = vehicle_to_base(state, settings).inv() * imu_to_base
@@ -166,12 +166,12 @@ def test_linearizing_changes_nothing_but_the_work() -> None:
 def test_what_slips_with_every_message_counts_as_often_as_it_lasts() -> None:
     """The part that lasts has the information of one message per two seconds, however many there are."""
     state, work = moving(1), make_work()
-    state["wheel_stamp"] = NEVER
+    state["rest"]["wheel_stamp"] = NEVER
     wheel.linearize(state, SPEED_ONLY, SETTINGS, work)
     once = float(work["noise"][0, 0])
     lasting = []
     for interval in (0.1, 0.02):
-        state["wheel_stamp"] = state["stamp"] - round(interval * 1e9)
+        state["rest"]["wheel_stamp"] = state["stamp"] - round(interval * 1e9)
         wheel.linearize(state, SPEED_ONLY, SETTINGS, work)
         lasting.append((work["noise"][0, 0] - once) * interval)
     single = lasting[0] / (2.0 * wheel.SLIP_TIME - 0.1)
@@ -199,10 +199,12 @@ def test_wheels_in_a_turn_say_little_of_the_yaw_rate() -> None:
     for turn_rate in (0.0, 0.5):
         state, work = moving(1, PLAIN), make_work()
         state["velocity_map"] = 0.0
-        state["wheel_stamp"] = state["stamp"] - 20_000_000
+        state["rest"]["wheel_stamp"] = state["stamp"] - 20_000_000
         up = np.array(PLAIN["imu_to_base"])[2]
         state["angular_rate"] = (
-            state["gyro_bias"] + to_rotation(state["attitude"]).inv().apply(state["earth_rate_map"]) + turn_rate * up
+            state["gyro_bias"]
+            + to_rotation(state["attitude"]).inv().apply(state["frame"]["earth_rate_map"])
+            + turn_rate * up
         )
         wheel.linearize(state, YAW_RATE_ONLY, PLAIN, work)
         noise.append(float(work["noise"][0, 0]))
@@ -220,7 +222,7 @@ def driving(speed: float, lateral_acceleration: float) -> Any:
     state = moving(1, PLAIN)
     state["attitude"] = (1.0, 0.0, 0.0, 0.0)
     state["velocity_map"] = np.array(PLAIN["imu_to_base"])[0] * speed
-    state["block_sum"][:3] = 100 * (state["accel_bias"] + (0.0, lateral_acceleration, 9.81))
+    state["rest"]["block_sum"][:3] = 100 * (state["accel_bias"] + (0.0, lateral_acceleration, 9.81))
     return state
 
 
@@ -239,11 +241,11 @@ def test_the_constraint_does_not_hold(missing: str) -> None:
     state, work = driving(10.0, 0.0), make_work()
     assert nhc.linearize(state, PLAIN, work) == 2
     if missing == "block":
-        state["block_end"] += 10**9
+        state["rest"]["block_end"] += 10**9
     elif missing == "samples":
-        state["block_count"], state["block_half_count"] = 2, 1
+        state["rest"]["block_count"], state["rest"]["block_half_count"] = 2, 1
     elif missing == "gap":
-        state["block_broken"] = 1
+        state["rest"]["block_broken"] = 1
     else:
         state["covariance"][8, 8] = 0.3**2
     assert nhc.linearize(state, PLAIN, work) == 0

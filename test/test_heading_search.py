@@ -117,7 +117,7 @@ def test_a_model_that_does_not_hold_is_not_believed():
     for _ in range(10):
         search.drive((2.0, 0.0), 0.2)
         search.velocity += 2.0 * 0.2 * search.to_map[:, 0]
-    assert np.hypot(*search.state["search"][4:6]) > 1.5
+    assert np.hypot(*search.state["search"]["estimate"][4:6]) > 1.5
     assert turn_found(search.state)[1] == math.inf
 
 
@@ -134,7 +134,7 @@ def test_a_bias_that_the_level_hid_comes_out_as_the_body_turns():
         bias = search.random.normal(0.0, bias_std, 2)
         angle, hidden = 0.0, bias
         search.tilt[:] = 0.0
-        search.state["search_started"] = 0
+        search.state["search"]["started"] = 0
         note_level(search.state, 0.0, bias_std**2, turned(angle), search.settings)
         begin_search(search.state, *search.random.normal(search.to_map @ LEVER, POSITION_STD), POSITION_STD**2)
         for k in range(2400):
@@ -151,7 +151,7 @@ def test_a_bias_that_the_level_hid_comes_out_as_the_body_turns():
             angle += DT * math.pi / 2.0 if 2.0 <= second < 3.0 else 0.0
             if k % 20 == 19:
                 search.fix(0, search.position + search.to_map @ LEVER, POSITION_STD, LEVER)
-        x, p = search.state["search"], search.state["search_covariance"]
+        x, p = search.state["search"]["estimate"], search.state["search"]["covariance"]
         off = x[4:6] - search.to_map[:, 0]
         squares.append(off @ np.linalg.solve(p[4:6, 4:6], off))
         # What is added to the measured acceleration: the opposite of the bias.
@@ -173,8 +173,8 @@ def test_the_search_stays_honest_for_long(name: str, start: float, stop: float) 
         undecided = {"alignment.found_heading_std_deg": 1e-3, "alignment.use_course": False}
         navigator, error = run(recording, velocity=False, **undecided)
         state = navigator.state[0]
-        p = state["search_covariance"][4:6, 4:6]
-        off = state["search"][4:6] - (math.cos(error), -math.sin(error))
+        p = state["search"]["covariance"][4:6, 4:6]
+        off = state["search"]["estimate"][4:6] - (math.cos(error), -math.sin(error))
         squares.append(off @ np.linalg.solve(p, off))
         assert np.sqrt(np.diag(p)).max() < 0.15
     assert sum(squares) < chi2.ppf(0.9999, 16), squares

@@ -31,7 +31,7 @@ def driven(request) -> tuple[Recording, np.ndarray]:
 
 def give_imu(navigator: Navigator, recording: Recording, until: int) -> np.ndarray:
     """Push the IMU samples newer than those the navigator has, up to ``until`` (ns)."""
-    part = (recording.imu_stamp > navigator.state["imu_stamp"][0]) & (recording.imu_stamp <= until)
+    part = (recording.imu_stamp > navigator.state["imu"]["stamp"][0]) & (recording.imu_stamp <= until)
     return navigator.push_imu(recording.imu_stamp[part], recording.specific_force[part], recording.angular_rate[part])
 
 
@@ -131,12 +131,12 @@ def test_a_heading_that_wheels_tell_turns_the_map_and_not_the_local_pose(driven)
         give_fix(navigator, recording, epoch)
     before = give_imu(navigator, recording, until)[-1]
     state = navigator._states[0]
-    assert state["search_started"] == 1
+    assert state["search"]["started"] == 1
     assert state["heading_known"] == 0
     quarter = SEARCH_COSINE, SEARCH_COSINE + 1
-    state["search"][list(quarter)] = 0.0, 1.0
-    state["search_covariance"][quarter, :] = state["search_covariance"][:, quarter] = 0.0
-    state["search_covariance"][quarter, quarter] = 1e-5
+    state["search"]["estimate"][list(quarter)] = 0.0, 1.0
+    state["search"]["covariance"][quarter, :] = state["search"]["covariance"][:, quarter] = 0.0
+    state["search"]["covariance"][quarter, quarter] = 1e-5
     navigator.push(Stream.WHEEL, until + 1, (1.0, 0.0, 0.0), np.diag([100.0, 1.0, -1.0]).ravel())
     after = give_imu(navigator, recording, until + SECOND // 20)[-1]
     assert navigator.state["heading_known"][0] == 1

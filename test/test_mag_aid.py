@@ -58,9 +58,9 @@ def in_the_field(seed: int, far: float, with_model: bool = True) -> tuple[Any, A
     rng = np.random.default_rng(seed)
     state["optional"][ERROR - ERROR_SIZE] = rng.normal(0.0, 0.05)
     state["optional"][IRON - ERROR_SIZE : IRON - ERROR_SIZE + 3] = rng.normal(0.0, 3e-6, 3)
-    state["field_declination"], state["field_inclination"] = DECLINATION, INCLINATION
-    state["field_strength"] = STRENGTH if with_model else 0.0
-    state["field_known"] = 1
+    state["mag"]["declination"], state["mag"]["inclination"] = DECLINATION, INCLINATION
+    state["mag"]["strength"] = STRENGTH if with_model else 0.0
+    state["mag"]["field_known"] = 1
     # The error turns the field clockwise: the angle from east that is measured is larger by it.
     angle = 0.5 * math.pi - DECLINATION + state["optional"][ERROR - ERROR_SIZE]
     level = math.cos(INCLINATION)
@@ -146,7 +146,7 @@ def test_where_the_field_is_upright_it_tells_no_heading() -> None:
 def test_the_error_changes_with_the_way_and_keeps_its_variance(way: tuple[float, float]) -> None:
     state, _ = in_the_field(2, 0.0)
     std = SETTINGS["optional_std"][ERROR - ERROR_SIZE]
-    state["mag_position"], state["mag_heading"] = state["position_map"], 3.1
+    state["mag"]["position"], state["mag"]["heading"] = state["position_map"], 3.1
     state["covariance"][ERROR, 0] = state["covariance"][0, ERROR] = 0.01
     before = float(state["optional"][ERROR - ERROR_SIZE])
     state["position_map"][0] += way[0]

@@ -264,7 +264,7 @@ def test_an_unknown_covariance_takes_the_table(recording, status):
 
 def geodetic_of(navigator: Navigator) -> tuple[float, float, float]:
     state = navigator.state[0]
-    ecef = state["origin_ecef"] + state["map_to_ecef"] @ state["position_map"]
+    ecef = state["frame"]["origin_ecef"] + state["frame"]["map_to_ecef"] @ state["position_map"]
     latitude, longitude, altitude = ecef_to_geodetic(*ecef)
     return math.degrees(latitude), math.degrees(longitude), altitude
 
@@ -303,7 +303,7 @@ ANY_FLOAT = st.floats(allow_nan=True, allow_infinity=True, width=64)
 def test_no_message_makes_the_state_non_finite(warm_navigator, values, covariance, covariance_type, status, force):
     """Whatever numbers arrive, what is published stays finite and the covariance positive."""
     navigator = warm_navigator
-    stamp = int(navigator.state["imu_stamp"][0])
+    stamp = int(navigator.state["imu"]["stamp"][0])
     navigator.push_gnss_position(stamp, *values, covariance, covariance_type, status)
     navigator.push_gnss_velocity(stamp, values, covariance)
     navigator.push_imu(np.array([stamp + 10_000_000]), np.array([force[:3]]), np.array([force[3:]]))

@@ -180,7 +180,7 @@ def fix_with_std(std: float) -> Any:
 @pytest.mark.parametrize(("std", "renewed"), [(1.0, False), (1.9, False), (0.6, False), (0.02, True), (5.0, True)])
 def test_another_kind_of_solution_has_another_error(std: float, renewed: bool) -> None:
     state = joined(3)
-    state["last_fix_variance"] = 2.0
+    state["window"]["last_fix_variance"] = 2.0
     reset_for_new_solution(state, fix_with_std(std), LASTING)
     assert (state["covariance"][PLACE, :3] == 0.0).all() == renewed
     assert (state["optional"][:3] == 0.0).all() == renewed

@@ -45,7 +45,7 @@ def published(state: Any, settings: Any) -> Any:
 def running(seed: int) -> Any:
     state = random_state(seed, far=100.0)
     core(state)[:] = random_covariance(seed, USUAL_STDS)
-    state["absolute_stamp"] = 0
+    state["recovery"]["absolute_stamp"] = 0
     return state
 
 
@@ -59,7 +59,7 @@ def twist_of_base(state: Any, mount_position: Any) -> Array:
     """Return linear and angular velocity of base_link relative to the Earth in its own axes."""
     imu = to_rotation(state["attitude"])
     mount = Rotation.from_euler("xyz", MOUNT_RPY_DEG, degrees=True)
-    rate = mount.apply(state["angular_rate"] - state["gyro_bias"] - imu.inv().apply(state["earth_rate_map"]))
+    rate = mount.apply(state["angular_rate"] - state["gyro_bias"] - imu.inv().apply(state["frame"]["earth_rate_map"]))
     linear = mount.apply(imu.inv().apply(state["velocity_map"])) - np.cross(rate, mount_position)
     return np.concatenate([linear, rate])
 
@@ -123,7 +123,7 @@ def expected_twist_covariance(state: Any, mount_position: Any, settings: Any) ->
     jacobian[3:, 6:9] = 0.0
     expected = jacobian @ core(state) @ jacobian.T
     expected[:3, 3:] = expected[3:, :3] = 0.0
-    expected[3:, 3:] += settings["gyro_noise_density"] ** 2 / state["imu_interval"] * np.eye(3)
+    expected[3:, 3:] += settings["gyro_noise_density"] ** 2 / state["imu"]["interval"] * np.eye(3)
     return np.asarray(expected)
 
 
@@ -167,12 +167,12 @@ def test_status_is_a_ladder() -> None:
     state["stamp"] = 1_000_000_001
     assert status_of(state, settings) == Status.COASTING
     # One fix per second: two of them may stay away.
-    state["absolute_interval"] = 1_000_000_000
+    state["recovery"]["absolute_interval"] = 1_000_000_000
     assert status_of(state, settings) == Status.GOOD
     state["stamp"] = 2_000_000_001
     assert status_of(state, settings) == Status.COASTING
     # A fix per minute: three seconds are the longest that is not called coasting.
-    state["absolute_interval"] = 60_000_000_000
+    state["recovery"]["absolute_interval"] = 60_000_000_000
     state["stamp"] = 3_000_000_001
     assert status_of(state, settings) == Status.COASTING
     state["stamp"] = 0
@@ -185,5 +185,5 @@ def test_status_is_a_ladder() -> None:
     ):
         state[field] = 0
         assert status_of(state, settings) == status
-    state["imu_stamp"] = NEVER
+    state["imu"]["stamp"] = NEVER
     assert status_of(state, settings) == Status.WAITING_IMU

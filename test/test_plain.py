@@ -106,7 +106,7 @@ compiled = lambda: {n: len(f.signatures) for n, f in found if isinstance(f, numb
 before = compiled()
 pilot = navigator.Navigator(from_mapping(recording.parameters()))
 for epoch, stamp in enumerate(recording.fix_stamp):
-    part = (recording.imu_stamp <= stamp) & (recording.imu_stamp > pilot.state["imu_stamp"][0])
+    part = (recording.imu_stamp <= stamp) & (recording.imu_stamp > pilot.state["imu"]["stamp"][0])
     pilot.push_imu(recording.imu_stamp[part], recording.specific_force[part], recording.angular_rate[part])
     pilot.push_gnss_position(int(stamp), *(float(v) for v in (recording.fix_latitude_deg[epoch],
         recording.fix_longitude_deg[epoch], recording.fix_altitude[epoch])), recording.fix_covariance[epoch], 2, 0)

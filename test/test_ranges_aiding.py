@@ -66,7 +66,7 @@ def tight_state(seed: int, far: float = 3000.0) -> Any:
 def signal_payload(state: Any, seed: int, elevation_deg: float = 40.0, flags: int = APPLIED) -> Array:
     """Return the payload of a satellite at this elevation, seen from the state."""
     rng = np.random.default_rng(seed)
-    ecef = state["origin_ecef"] + state["map_to_ecef"] @ state["position_map"]
+    ecef = state["frame"]["origin_ecef"] + state["frame"]["map_to_ecef"] @ state["position_map"]
     latitude, longitude, _ = ecef_to_geodetic(*ecef)
     elevation, azimuth = math.radians(elevation_deg), rng.uniform(0.0, 2.0 * math.pi)
     local = [math.cos(elevation) * math.sin(azimuth), math.cos(elevation) * math.cos(azimuth), math.sin(elevation)]
@@ -146,9 +146,9 @@ def test_prediction_and_noise_are_those_of_the_range_model(seed: int, flags: int
     payload[signal_place.KLOBUCHAR : signal_place.KLOBUCHAR + 8] = klobuchar
     turn = to_rotation(state["attitude"])
     arm = settings["lever_arms_body"][0]
-    rate = state["angular_rate"] - state["gyro_bias"] - turn.inv().apply(state["earth_rate_map"])
-    antenna = state["origin_ecef"] + state["map_to_ecef"] @ (state["position_map"] + turn.apply(arm))
-    motion = state["map_to_ecef"] @ (state["velocity_map"] + turn.apply(np.cross(rate, arm)))
+    rate = state["angular_rate"] - state["gyro_bias"] - turn.inv().apply(state["frame"]["earth_rate_map"])
+    antenna = state["frame"]["origin_ecef"] + state["frame"]["map_to_ecef"] @ (state["position_map"] + turn.apply(arm))
+    motion = state["frame"]["map_to_ecef"] @ (state["velocity_map"] + turn.apply(np.cross(rate, arm)))
     signal = np.zeros(1, MEASURED_SIGNAL)[0]
     signal["gnss_id"], signal["sv_id"], signal["flags"] = Gnss.GALILEO, 11, flags
     signal["pseudorange"], signal["range_rate"] = 22.1e6, -300.0
@@ -171,8 +171,8 @@ def test_prediction_and_noise_are_those_of_the_range_model(seed: int, flags: int
     range_rate.linearize(state, payload, settings, work)
     np.testing.assert_allclose(work["innovation"][0], expected["doppler_residual"] - drift, rtol=0.0, atol=1e-8)
     lever = turn.apply(arm)
-    unit = state["map_to_ecef"].T @ expected["line_of_sight"]
-    gyro = settings["gyro_noise_density"] ** 2 / state["imu_interval"] * np.sum(np.cross(unit, lever) ** 2)
+    unit = state["frame"]["map_to_ecef"].T @ expected["line_of_sight"]
+    gyro = settings["gyro_noise_density"] ** 2 / state["imu"]["interval"] * np.sum(np.cross(unit, lever) ** 2)
     np.testing.assert_allclose(work["noise"][0, 0], expected["doppler_std"] ** 2 + gyro, rtol=1e-9)
 
 

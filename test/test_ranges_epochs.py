@@ -164,7 +164,7 @@ def test_a_start_that_fails_moves_no_local_pose() -> None:
     navigator = tight_navigator(recording, **changes)
     rows = []
     for k in range(len(ranges.stamp)):
-        newest = navigator.state["imu_stamp"][0]
+        newest = navigator.state["imu"]["stamp"][0]
         part = (recording.imu_stamp > newest) & (recording.imu_stamp <= ranges.stamp[k])
         samples = (recording.imu_stamp, recording.specific_force, recording.angular_rate)
         rows.append(navigator.push_imu(*(column[part] for column in samples)))
@@ -208,7 +208,7 @@ def test_a_jump_by_milliseconds_costs_nothing(jumps: tuple[int, ...]) -> None:
         jumped.bias[k] += total * MILLISECOND
     before = follow(recording, plain, tight_navigator(recording))
     after = follow(recording, jumped, tight_navigator(recording))
-    assert after.navigator.state["clock_jumps"][0] == sum(abs(jump) for jump in jumps)
+    assert after.navigator.state["tight"]["clock_jumps"][0] == sum(abs(jump) for jump in jumps)
     np.testing.assert_array_equal(after.records["verdict"], before.records["verdict"])
     np.testing.assert_allclose(after.error, before.error, rtol=0.0, atol=1e-6)
     np.testing.assert_allclose(after.clock_error, before.clock_error, rtol=0.0, atol=1e-6)
@@ -226,7 +226,7 @@ def test_a_jump_is_followed_with_one_satellite_and_over_an_outage() -> None:
         elif 200 <= k < 210:
             signals["status"][1:] = RangeStatus.LOW_CN0
     outcome = follow(recording, ranges, tight_navigator(recording))
-    assert outcome.navigator.state["clock_jumps"][0] == 2
+    assert outcome.navigator.state["tight"]["clock_jumps"][0] == 2
     assert np.isin(outcome.of(Stream.PSEUDORANGE, 3.0)["verdict"], PASSED).mean() > 0.998
     # Nobody can know of the jump before the first satellite.
     assert sane(outcome, 5.0, hidden=(29.0, 40.0))
@@ -248,8 +248,8 @@ def test_a_clock_that_is_set_anew_costs_no_satellite(count: int) -> None:
     outcome = follow(recording, ranges, tight_navigator(recording))
     for stream in (Stream.PSEUDORANGE, Stream.RANGE_RATE):
         assert np.isin(outcome.of(stream, 3.0)["verdict"], PASSED).mean() > 0.998
-    assert outcome.navigator.state["range_faults"][0] == 0
-    assert outcome.navigator.state["clock_jumps"][0] == 0
+    assert outcome.navigator.state["tight"]["range_faults"][0] == 0
+    assert outcome.navigator.state["tight"]["clock_jumps"][0] == 0
     assert sane(outcome, 5.0)
 
 
@@ -326,7 +326,7 @@ def test_a_wrong_state_is_outvoted(off: tuple[float, float, float]) -> None:
         last = end + 1
         ranges.push(navigator, k)
         navigator.update()
-    assert navigator.state["range_faults"][0] >= 1
+    assert navigator.state["tight"]["range_faults"][0] >= 1
     truth = int(np.searchsorted(recording.truth_stamp, recording.imu_stamp[last - 1]))
     error = state_error(recording, last - 1, truth, navigator.state[0])
     std = np.sqrt(np.diag(navigator.state["covariance"][0])[:3])
@@ -344,7 +344,7 @@ def test_satellites_that_return_are_welcome() -> None:
     assert sane(outcome, 5.0)
     back = outcome.of(Stream.PSEUDORANGE, 99.0)
     assert np.isin(back["verdict"], PASSED).mean() > 0.998
-    assert outcome.navigator.state["range_faults"][0] == 0
+    assert outcome.navigator.state["tight"]["range_faults"][0] == 0
     assert outcome.navigator.restarts == 0
 
 
@@ -560,9 +560,9 @@ def test_what_is_shuffled_is_no_idle_filter(pull_away):
     messages = all_messages(recording, ranges, np.random.default_rng(0), 0.0)
     state, _, records = give(recording, ranges, sorted(messages, key=lambda m: m.arrival))
     assert np.isin(records["verdict"], PASSED).mean() > 0.75
-    assert np.frombuffer(state["clock_jumps"], np.int64)[0] == 1
+    assert np.frombuffer(state["tight"]["clock_jumps"], np.int64)[0] == 1
     assert np.frombuffer(state["heading_known"], np.int64)[0] == 1
-    assert np.frombuffer(state["range_faults"], np.int64)[0] >= 1
+    assert np.frombuffer(state["tight"]["range_faults"], np.int64)[0] >= 1
 
 
 def plain_run(path: Path) -> None:

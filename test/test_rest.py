@@ -70,7 +70,7 @@ def test_body_velocity_is_that_of_its_point_in_its_axes(seed: int) -> None:
     body_to_map = Rotation.from_quat(state["attitude"][[1, 2, 3, 0]])
     imu_to_base = Rotation.from_euler("xyz", [160.0, -25.0, 130.0], degrees=True)
     sensor_to_base = Rotation.from_euler("xyz", RPY_DEG, degrees=True)
-    rate = state["angular_rate"] - state["gyro_bias"] - body_to_map.inv().apply(state["earth_rate_map"])
+    rate = state["angular_rate"] - state["gyro_bias"] - body_to_map.inv().apply(state["frame"]["earth_rate_map"])
     arm = imu_to_base.inv().apply(np.subtract([1.5, -0.4, -0.6], [0.3, 0.1, -0.2]))
     velocity_body = body_to_map.inv().apply(state["velocity_map"]) + np.cross(rate, arm)
     expected = sensor_to_base.inv().apply(imu_to_base.apply(velocity_body))
@@ -83,11 +83,11 @@ def resting(seed: int) -> Any:
     state["velocity_map"] = np.random.default_rng(seed).normal(0.0, 0.01, 3)
     state["covariance"][:15, :15] = np.diag(np.repeat([1.0, 0.01, 1e-4, 0.01, 1e-6], 3))
     stamp = 100 * CONSTRAINT_INTERVAL
-    state["stamp"] = state["imu_stamp"] = state["block_end"] = state["resting_stamp"] = stamp
-    state["block_count"], state["block_half_count"] = 10, 5
+    state["stamp"] = state["imu"]["stamp"] = state["rest"]["block_end"] = state["rest"]["resting_stamp"] = stamp
+    state["rest"]["block_count"], state["rest"]["block_half_count"] = 10, 5
     readings = np.concatenate([state["specific_force"], state["angular_rate"]])
-    state["block_sum"], state["block_half_sum"] = 10.0 * readings, 5.0 * readings
-    state["block_square_sum"] = 10.0 * readings**2
+    state["rest"]["block_sum"], state["rest"]["block_half_sum"] = 10.0 * readings, 5.0 * readings
+    state["rest"]["block_square_sum"] = 10.0 * readings**2
     return state
 
 
@@ -108,13 +108,13 @@ def test_jacobian_of_rest(seed: int) -> None:
 def test_what_is_no_rest(evidence: str) -> None:
     state, work = resting(1), make_work()
     if evidence == "motion":
-        state["moving_stamp"] = state["stamp"]
+        state["rest"]["moving_stamp"] = state["stamp"]
     elif evidence == "shaking":
-        state["block_square_sum"] += 10.0 * np.repeat([1.0, 0.04], 3)
+        state["rest"]["block_square_sum"] += 10.0 * np.repeat([1.0, 0.04], 3)
     elif evidence == "turn":
-        state["block_half_sum"][5] += 5.0 * 0.3
+        state["rest"]["block_half_sum"][5] += 5.0 * 0.3
     else:
-        state["block_broken"] = 1
+        state["rest"]["block_broken"] = 1
     before = copy_of(state)
     assert zupt.linearize(state, SETTINGS, work) == zaru.linearize(state, SETTINGS, work) == 0
     assert state.tobytes() == before.tobytes()
@@ -206,5 +206,5 @@ def test_two_antennas_of_a_robot_at_rest_are_no_motion(std: float) -> None:
                 frame_id=frame,
             )
     state = navigator.state[0]
-    assert state["moving_stamp"] < recording.imu_stamp[0]
-    assert state["still_count"] > 4000
+    assert state["rest"]["moving_stamp"] < recording.imu_stamp[0]
+    assert state["window"]["still_samples"] > 4000

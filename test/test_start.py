@@ -12,8 +12,8 @@ from kernels import make_settings
 from monte_carlo import Run, feed, nees
 from scipy.stats import chi2
 
+from eskf_ros.filter.layout import blank_state
 from eskf_ros.filter.state.enums import Status
-from eskf_ros.filter.state.layout import blank_state
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity import residual_motion
 from eskf_ros.simulate.recording import Recording
@@ -40,8 +40,8 @@ def window_of(rates: Any) -> Any:
         state["angular_rate"] = rate
         residual_motion.add_to_part(state)
         # What the watch for stillness does between the first and the last sample of a window.
-        state["window_start"] = 1
-        assert k < 199 or state["parts"] == PARTS - 1
+        state["window"]["start"] = 1
+        assert k < 199 or state["residual"]["parts"] == PARTS - 1
     return state
 
 
@@ -69,11 +69,11 @@ def test_waves_are_sway_of_their_size() -> None:
 
 def test_a_new_window_begins_new_parts() -> None:
     state = window_of(np.ones((200, 3)))
-    state["window_start"] = NEVER
+    state["window"]["start"] = NEVER
     state["angular_rate"] = 0.0
     residual_motion.add_to_part(state)
-    assert state["parts"] == 0
-    assert (state["part_sum"] == 0.0).all()
+    assert state["residual"]["parts"] == 0
+    assert (state["residual"]["part_sum"] == 0.0).all()
 
 
 @pytest.mark.parametrize("grade", ["consumer", "industrial"])

@@ -90,8 +90,8 @@ def offered(stream: Stream, stamp: int, values: Any, stds: Any) -> Any:
 def test_what_one_message_says(stream: Stream, values: Any, stds: Any, says: str) -> None:
     state = make_state()
     update_rest_evidence(state, offered(stream, 7 * SECOND, values, stds), SETTINGS)
-    assert state["resting_stamp"] == (7 * SECOND if says == "rest" else NEVER)
-    assert state["moving_stamp"] == (7 * SECOND if says == "motion" else NEVER)
+    assert state["rest"]["resting_stamp"] == (7 * SECOND if says == "rest" else NEVER)
+    assert state["rest"]["moving_stamp"] == (7 * SECOND if says == "motion" else NEVER)
 
 
 def place(north: float) -> tuple[float, float, float]:
@@ -113,35 +113,35 @@ def place(north: float) -> tuple[float, float, float]:
 def test_fixes_tell_rest_from_motion_as_soon_as_they_can(std: float, speed: float, seconds: float, says: str) -> None:
     """How far the robot is from where it was when the IMU became quiet, and how well that is known."""
     state = make_state()
-    state["quiet"] = 1
+    state["rest"]["quiet"] = 1
     start = SECOND
     for elapsed in (0.0, seconds):
         stamp = start + round(elapsed * SECOND)
         update_rest_evidence(
             state, offered(Stream.GNSS_POSITION, stamp, place(speed * elapsed), (std, std, std)), SETTINGS
         )
-    assert (state["resting_stamp"] > NEVER) == (says == "rest")
-    assert (state["moving_stamp"] > NEVER) == (says == "motion")
+    assert (state["rest"]["resting_stamp"] > NEVER) == (says == "rest")
+    assert (state["rest"]["moving_stamp"] > NEVER) == (says == "motion")
 
 
 @pytest.mark.parametrize(("climb", "moves"), [(0.0, False), (0.5, False), (12.0, True), (-12.0, True)])
 def test_pressure_that_changes_is_motion(climb: float, moves: bool) -> None:
     state = make_state()
-    state["quiet"] = 1
+    state["rest"]["quiet"] = 1
     for second, height in ((1, 0.0), (9, climb)):
         pressure = 95_000.0 - 11.8 * height
         update_rest_evidence(
             state, offered(Stream.BARO, second * SECOND, (pressure, 0.0, 0.0), (5.0, -1.0, -1.0)), SETTINGS
         )
-    assert (state["moving_stamp"] > NEVER) == moves
+    assert (state["rest"]["moving_stamp"] > NEVER) == moves
 
 
 def test_how_quiet_rest_is_is_learnt_where_it_is_seen() -> None:
     """And how quiet motion is; what nobody has seen teaches nothing."""
     state = make_state()
-    state["block_end"] = 10 * CONSTRAINT_INTERVAL
-    state["block_count"], state["block_half_count"] = 100, 50
-    state["block_square_sum"][:3] = 100 * 0.02**2
+    state["rest"]["block_end"] = 10 * CONSTRAINT_INTERVAL
+    state["rest"]["block_count"], state["rest"]["block_half_count"] = 100, 50
+    state["rest"]["block_square_sum"][:3] = 100 * 0.02**2
     quiet = copy_of(state)
     learn_from_block(quiet, SETTINGS)
     assert quiet["resting_level"] == quiet["moving_level"] == 0.0
@@ -156,13 +156,13 @@ def test_how_quiet_rest_is_is_learnt_where_it_is_seen() -> None:
 def test_what_comes_before_motion_does_not_spoil_what_rest_is() -> None:
     """Wheels read zero until the car moves at half a metre per second: six seconds of that, twenty times as loud."""
     state = make_state()
-    state["resting_level"] = 0.01
+    state["rest"]["resting_activity"] = 0.01
     for second in range(6):
-        state["block_end"] = state["resting_stamp"] = (10 + second) * CONSTRAINT_INTERVAL
-        state["block_count"], state["block_half_count"] = 100, 50
-        state["block_square_sum"][0] = 100 * 0.2 * SETTINGS["still_accel_std"] ** 2
+        state["rest"]["block_end"] = state["rest"]["resting_stamp"] = (10 + second) * CONSTRAINT_INTERVAL
+        state["rest"]["block_count"], state["rest"]["block_half_count"] = 100, 50
+        state["rest"]["block_square_sum"][0] = 100 * 0.2 * SETTINGS["still_accel_std"] ** 2
         learn_from_block(state, SETTINGS)
-    assert 0.01 < state["resting_level"] < 0.02
+    assert 0.01 < state["rest"]["resting_activity"] < 0.02
 
 
 # ---------------------------------------------------------------------------------------------------------- no rest

@@ -196,7 +196,7 @@ def test_standing_on_the_turning_earth() -> None:
     gravity = np.array(gravity_map(state, (2000.0, 1000.0, 30.0)))
     stamps = stamps_at(100, 600.0)
     force = np.tile(attitude.inv().apply(-gravity), (len(stamps), 1))
-    rate = np.tile(attitude.inv().apply(state["earth_rate_map"]), (len(stamps), 1))
+    rate = np.tile(attitude.inv().apply(state["frame"]["earth_rate_map"]), (len(stamps), 1))
     run_samples(state, stamps, force, rate, SETTINGS, WORK)
     # Rounding of 60 000 attitudes tilts by 1e-12 rad.
     np.testing.assert_allclose(state["position_map"], (2000.0, 1000.0, 30.0), rtol=0.0, atol=5e-6)

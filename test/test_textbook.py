@@ -63,7 +63,7 @@ def test_antenna_of_the_turning_van_moves_sideways() -> None:
     """Yaw rate 0.2 rad/s to the right: 0.3 m/s to the right, which is east for a van that faces north."""
     state, settings = van(FACING_NORTH)
     # To the right is about down; the gyro senses the Earth's turning as well.
-    state["angular_rate"] = (0.0, 0.0, -0.2) + FACING_NORTH.inv().apply(state["earth_rate_map"])
+    state["angular_rate"] = (0.0, 0.0, -0.2) + FACING_NORTH.inv().apply(state["frame"]["earth_rate_map"])
     velocity = north_east_down(gnss_velocity.predict(state, 0, settings))
     np.testing.assert_allclose(velocity, (0.0, 0.3, 0.0), rtol=0.0, atol=1e-12)
 
@@ -71,7 +71,7 @@ def test_antenna_of_the_turning_van_moves_sideways() -> None:
 def test_a_tenth_of_a_degree_of_tilt_leaks_gravity() -> None:
     """0.017 m/s2 sideways: what a level, resting IMU gains in a second with an attitude 0.1 degrees off."""
     state = make_state(attitude=Rotation.from_euler("x", 0.1, degrees=True))
-    state["earth_rate_map"] = 0.0
+    state["frame"]["earth_rate_map"] = 0.0
     gravity = gravity_map(state, (0.0, 0.0, 0.0))
     stamps = np.arange(0, 1_000_000_001, 10_000_000, dtype=np.int64)
     force = np.tile((0.0, 0.0, -gravity[2]), (len(stamps), 1))
@@ -86,7 +86,7 @@ def test_20_ms_at_30_m_per_s() -> None:
     state["velocity_map"] = (30.0, 0.0, 0.0)
     gravity = gravity_map(state, (0.0, 0.0, 0.0))
     force = np.tile((0.0, 0.0, -gravity[2]), (2, 1))
-    datum = state["datum"]
+    datum = state["frame"]["datum"]
     payload = np.array([datum[0], datum[1], datum[2], 1.0, 0.0, 0.0, 1.0, 0.0, 1.0])
     innovations = []
     for _ in range(2):

@@ -279,7 +279,7 @@ def test_every_verdict_is_told_once_and_without_late_data_it_is_final(parked):
     navigator = Navigator(from_mapping(parked.parameters()))
     told = []
     for epoch, stamp in enumerate(parked.fix_stamp):
-        part = (parked.imu_stamp <= stamp + 10_000_000) & (parked.imu_stamp > navigator.state["imu_stamp"][0])
+        part = (parked.imu_stamp <= stamp + 10_000_000) & (parked.imu_stamp > navigator.state["imu"]["stamp"][0])
         place = (parked.fix_latitude_deg, parked.fix_longitude_deg, parked.fix_altitude)
         navigator.push_gnss_position(
             int(stamp), *(float(values[epoch]) for values in place), parked.fix_covariance[epoch], 2, 0

@@ -11,7 +11,7 @@ from eskf_ros.filter.alignment.levelling import reset_level_to_moving
 from eskf_ros.filter.history.timeline import open_record
 from eskf_ros.filter.inertial.navigation_frame import heading_of
 from eskf_ros.filter.integrity.fix_tracker import update_track
-from eskf_ros.filter.integrity.monitors import watch_course, watch_field, watch_heading
+from eskf_ros.filter.integrity.heading_monitor import watch_course, watch_field, watch_heading
 from eskf_ros.filter.integrity.receiver_monitor import watch_aid
 from eskf_ros.filter.integrity.recovery import gate_of, note, recover, reset_for_new_solution
 from eskf_ros.filter.measurements import (
@@ -157,7 +157,7 @@ def is_aligned_for(state, stream):
     if stream in (Stream.GNSS_VELOCITY, Stream.HEADING, Stream.BARO):
         return state.position_known == 1
     if stream == Stream.MAG:
-        return state.position_known == 1 and state.field_known == 1
+        return state.position_known == 1 and state.mag.field_known == 1
     return state.position_known == 1 and state.heading_known == 1
 
 

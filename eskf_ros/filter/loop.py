@@ -7,7 +7,7 @@ from eskf_ros.filter.alignment.levelling import update_level
 from eskf_ros.filter.fuse import fuse
 from eskf_ros.filter.history.timeline import rewind, save_checkpoint
 from eskf_ros.filter.inertial.navigation_frame import heading_of
-from eskf_ros.filter.integrity.monitors import watch_input
+from eskf_ros.filter.integrity.imu_monitor import watch_input
 from eskf_ros.filter.integrity.restart import restart
 from eskf_ros.filter.output.global_odometry import write_odometry
 from eskf_ros.filter.output.local_odometry import carry, measure_step, note_jump
@@ -39,7 +39,7 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
             predict(state, aids[state.aid_next].stamp, sample, settings, work)
             state.aid_next = fuse_next(state, aids, t.aid_count, settings, work)
 
-        previous_stamp = state.imu_stamp
+        previous_stamp = state.imu.stamp
         predict(state, sample.stamp, sample, settings, work)
         take_sample(state, sample)
         measure_step(state, settings)
@@ -66,7 +66,7 @@ def predict(state, stamp, sample, settings, work):
     """Bring the state to ``stamp``, at or before the IMU sample that comes next."""
     if state.level_known == 0:
         return
-    if sample.stamp - state.imu_stamp > LONGEST_GAP:
+    if sample.stamp - state.imu.stamp > LONGEST_GAP:
         position = (state.position_map[0], state.position_map[1], state.position_map[2])
         restart(state)
         note_jump(state, position, heading_of(state, settings), settings)
@@ -88,16 +88,16 @@ def update_rest(state, settings):
 @njit
 def take_sample(state, sample):
     """Make an IMU sample the newest reading of the state."""
-    if state.imu_stamp != NEVER:
-        state.imu_interval = (sample.stamp - state.imu_stamp) * 1e-9
-    state.imu_stamp = sample.stamp
+    if state.imu.stamp != NEVER:
+        state.imu.interval = (sample.stamp - state.imu.stamp) * 1e-9
+    state.imu.stamp = sample.stamp
     state.stamp = sample.stamp
     state.imu_next += 1
     for i in range(3):
-        state.earlier_force[i] = state.imu_force[i]
-        state.earlier_rate[i] = state.imu_rate[i]
-        state.imu_force[i] = sample.specific_force[i]
-        state.imu_rate[i] = sample.angular_rate[i]
+        state.imu.earlier_force[i] = state.imu.force[i]
+        state.imu.earlier_rate[i] = state.imu.rate[i]
+        state.imu.force[i] = sample.specific_force[i]
+        state.imu.rate[i] = sample.angular_rate[i]
         state.specific_force[i] = sample.specific_force[i]
         state.angular_rate[i] = sample.angular_rate[i]
 

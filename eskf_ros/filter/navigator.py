@@ -27,9 +27,10 @@ from eskf_ros.filter.history.timeline import (
 )
 from eskf_ros.filter.inertial.navigation_frame import heading_of, move_datum, set_datum
 from eskf_ros.filter.integrity.fix_tracker import forget_tracks
-from eskf_ros.filter.integrity.monitors import complaints, is_heading_contradicted
+from eskf_ros.filter.integrity.heading_monitor import complaints, is_heading_contradicted
 from eskf_ros.filter.integrity.receiver_monitor import aid_complaints
 from eskf_ros.filter.integrity.recovery import phase_of
+from eskf_ros.filter.layout import STATE, WORK, blank_state
 from eskf_ros.filter.loop import advance
 from eskf_ros.filter.measurements import heading, mag
 from eskf_ros.filter.output.global_odometry import ODOMETRY, status_of, write_odometry
@@ -37,7 +38,6 @@ from eskf_ros.filter.output.local_odometry import LOCAL, note_jump
 from eskf_ros.filter.settings import UNKNOWN_ANGLE_VARIANCE, intakes_from, settings_from
 from eskf_ros.filter.state.enums import Phase, Status, Stream, Verdict
 from eskf_ros.filter.state.error_state import ERROR_SIZE, INTER_SYSTEM
-from eskf_ros.filter.state.layout import STATE, WORK, blank_state
 from eskf_ros.filter.state.memory import allocate
 from eskf_ros.filter.state.time import NEVER, SECOND
 from eskf_ros.filter.tight.epoch import offer_signals
@@ -155,7 +155,7 @@ class Navigator:
         state = self._states[0]
         if not state["position_known"]:
             return False
-        ecef = state["origin_ecef"] + state["map_to_ecef"] @ state["position_map"]
+        ecef = state["frame"]["origin_ecef"] + state["frame"]["map_to_ecef"] @ state["position_map"]
         latitude, longitude, altitude = ecef_to_geodetic(*ecef)
         self.set_datum(math.degrees(latitude), math.degrees(longitude), altitude)
         return True
@@ -184,7 +184,7 @@ class Navigator:
         """
         self.update()
         state, settings = self._states[0], self._settings[0]
-        if not (state["level_known"] and state["datum_known"]):
+        if not (state["level_known"] and state["frame"]["datum_known"]):
             return False
         before, heading_before = tuple(state["position_map"]), heading_of(state, settings)
         covariance = np.ascontiguousarray(position_covariance, np.float64)
@@ -423,10 +423,12 @@ class Navigator:
         state, row = self._states[0], self.odometry[0]
         if row["status"] not in (Status.ALIGNING, Status.GOOD, Status.COASTING, Status.DEGRADED):
             return None
-        ecef = state["origin_ecef"] + state["map_to_ecef"] @ row["position_map"]
+        ecef = state["frame"]["origin_ecef"] + state["frame"]["map_to_ecef"] @ row["position_map"]
         latitude, longitude, altitude = ecef_to_geodetic(*ecef)
         forward_map = np.array(to_matrix(tuple(row["attitude_body_to_map"])))[:, 0]
-        east, north, _ = np.array(east_north_up_to_ecef(latitude, longitude)).T @ state["map_to_ecef"] @ forward_map
+        east, north, _ = (
+            np.array(east_north_up_to_ecef(latitude, longitude)).T @ state["frame"]["map_to_ecef"] @ forward_map
+        )
         variances = np.diagonal(row["pose_covariance"])
         biases = {
             name: tuple(row[name].tolist()) for name in ("accel_bias", "accel_bias_std", "gyro_bias", "gyro_bias_std")
@@ -446,16 +448,16 @@ class Navigator:
     def datum(self) -> tuple[float, float, float] | None:
         """Origin of the map frame: latitude and longitude (deg) and altitude (m), None before the first fix."""
         state = self._states[0]
-        if not state["datum_known"]:
+        if not state["frame"]["datum_known"]:
             return None
-        latitude, longitude, altitude = (float(value) for value in state["datum"])
+        latitude, longitude, altitude = (float(value) for value in state["frame"]["datum"])
         return math.degrees(latitude), math.degrees(longitude), altitude
 
     @property
     def clock(self) -> tuple[float, float] | None:
         """Bias (m) and drift (m/s) of the receiver's clock; None while ranges have not told both."""
         state, place = self._states[0], int(self._settings["clock_at"][0])
-        if place >= state["error_size"] or not state["clock_known"].all():
+        if place >= state["error_size"] or not state["tight"]["clock_known"].all():
             return None
         bias, drift = state["optional"][place - ERROR_SIZE : place - ERROR_SIZE + 2].tolist()
         return bias, drift
@@ -481,12 +483,12 @@ class Navigator:
     @property
     def clock_jumps(self) -> int:
         """Milliseconds by which the receiver's clock has jumped, to either side."""
-        return int(self._states["clock_jumps"][0])
+        return int(self._states["tight"]["clock_jumps"][0])
 
     @property
     def range_faults(self) -> int:
         """How often most satellites contradicted the estimate, which was then given the uncertainty they show."""
-        return int(self._states["range_faults"][0])
+        return int(self._states["tight"]["range_faults"][0])
 
     @property
     def imu_counts(self) -> dict[str, int]:
@@ -512,7 +514,7 @@ class Navigator:
     @property
     def position_resets(self) -> int:
         """How often fixes that agree with each other won over the filter: position and velocity were reset to them."""
-        return int(self._states["resets"][0])
+        return int(self._states["recovery"]["resets"][0])
 
     def phase(self, stream: Stream, source: int = 0) -> Phase:
         """Return what an aid is to the filter at the moment; ``source``: which receiver."""

@@ -37,7 +37,7 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
         predict_search(state, acceleration, middle, dt, settings)
         velocity_noise += WANDER_TIME * (WANDER_ACCELERATION**2 + dot(acceleration, acceleration))
     size = state.error_size
-    propagate_covariance(state.covariance, size, middle, force, gravity, state.earth_rate_map, dt, coupling, work)
+    propagate_covariance(state.covariance, size, middle, force, gravity, state.frame.earth_rate_map, dt, coupling, work)
     add_noise(state.covariance, velocity_noise, attitude_noise, dt, settings)
     if size > ERROR_SIZE:
         augmented_states.propagate_augmented(state, dt, settings)
@@ -51,13 +51,13 @@ def propagate(state, stamp, sample, settings, work):
     before (Adams-Moulton): cut anywhere, the parts give the whole. A long interval is integrated in steps; one longer
     than the gap of the settings may hide motion and costs extra uncertainty.
     """
-    interval = (sample.stamp - state.imu_stamp) / SECOND
-    force_0, force_1 = line(state.earlier_force, state.imu_force, sample.specific_force, interval, state, settings)
-    rate_0, rate_1 = line(state.earlier_rate, state.imu_rate, sample.angular_rate, interval, state, settings)
+    interval = (sample.stamp - state.imu.stamp) / SECOND
+    force_0, force_1 = line(state.imu.earlier_force, state.imu.force, sample.specific_force, interval, state, settings)
+    rate_0, rate_1 = line(state.imu.earlier_rate, state.imu.rate, sample.angular_rate, interval, state, settings)
     gap = interval if interval > settings.imu_gap else 0.0
     steps = (stamp - state.stamp + LONGEST_STEP - 1) // LONGEST_STEP
-    begin = (state.stamp - state.imu_stamp) / SECOND / interval
-    end = (stamp - state.imu_stamp) / SECOND / interval
+    begin = (state.stamp - state.imu.stamp) / SECOND / interval
+    end = (stamp - state.imu.stamp) / SECOND / interval
     force_a = between(force_0, force_1, begin)
     rate_a = between(rate_0, rate_1, begin)
     for k in range(steps):
@@ -67,8 +67,8 @@ def propagate(state, stamp, sample, settings, work):
         step(state, force_a, rate_a, force_b, rate_b, (end - begin) * interval / steps, gap, settings, work)
         force_a = force_b
         rate_a = rate_b
-    force = between(state.imu_force, sample.specific_force, end)
-    rate = between(state.imu_rate, sample.angular_rate, end)
+    force = between(state.imu.force, sample.specific_force, end)
+    rate = between(state.imu.rate, sample.angular_rate, end)
     for i in range(3):
         state.specific_force[i] = force[i]
         state.angular_rate[i] = rate[i]
@@ -79,12 +79,12 @@ def propagate(state, stamp, sample, settings, work):
 def line(earlier, last, following, interval, state, settings):
     """Return the ends of the straight line that stands for the IMU between two samples (see ``propagate``)."""
     bend = 0.0
-    if interval <= settings.imu_gap and 0.0 < state.imu_interval <= settings.imu_gap:
-        bend = interval * interval / (6.0 * (interval + state.imu_interval))
+    if interval <= settings.imu_gap and 0.0 < state.imu.interval <= settings.imu_gap:
+        bend = interval * interval / (6.0 * (interval + state.imu.interval))
     shift = (
-        bend * ((following[0] - last[0]) / interval - (last[0] - earlier[0]) / state.imu_interval),
-        bend * ((following[1] - last[1]) / interval - (last[1] - earlier[1]) / state.imu_interval),
-        bend * ((following[2] - last[2]) / interval - (last[2] - earlier[2]) / state.imu_interval),
+        bend * ((following[0] - last[0]) / interval - (last[0] - earlier[0]) / state.imu.interval),
+        bend * ((following[1] - last[1]) / interval - (last[1] - earlier[1]) / state.imu.interval),
+        bend * ((following[2] - last[2]) / interval - (last[2] - earlier[2]) / state.imu.interval),
     )
     return (
         (last[0] - shift[0], last[1] - shift[1], last[2] - shift[2]),

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtri
 
+from eskf_ros.filter.layout import SETTINGS
 from eskf_ros.filter.state.enums import CONSTRAINTS, Stream
 from eskf_ros.filter.state.error_state import ERROR_SIZE, INTER_SYSTEM, NOWHERE, OPTIONAL_SIZES
-from eskf_ros.filter.state.layout import SETTINGS
 from eskf_ros.filter.state.memory import allocate
 from eskf_ros.filter.state.time import SECOND
 from eskf_ros.geodesy.rotation import from_roll_pitch_yaw, to_matrix

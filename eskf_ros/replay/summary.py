@@ -197,8 +197,8 @@ def ranges_result(navigator: Navigator, intake: RangeIntake, feed: Feed) -> dict
             "withheld": sum(count for kind, count in feed.withheld.items() if kind.name == "ranges"),
             "point_solutions": intake.solved,
             "signals": {status.name.lower(): count for status, count in sorted(navigator.range_statuses.items())},
-            "clock_jumps_ms": int(state["clock_jumps"]),
-            "outvoted_states": int(state["range_faults"]),
+            "clock_jumps_ms": int(state["tight"]["clock_jumps"]),
+            "outvoted_states": int(state["tight"]["range_faults"]),
         }
     }
 

@@ -26,7 +26,7 @@ START_VELOCITY_STD = 100.0
 def reset_position_to_fix(state, payload):
     """Take position from the first fix, with a wide prior that the update of this same fix makes narrow."""
     old_up = local_up(state)
-    if state.datum_known == 0:
+    if state.frame.datum_known == 0:
         set_datum(state, payload[0], payload[1], payload[2])
     position = position_of_fix(state, payload)
     covariance = state.covariance
@@ -70,4 +70,4 @@ def place(state, position, position_covariance, heading, heading_std, settings):
             covariance[POSITION + i, POSITION + j] = position_covariance[i, j]
     state.position_known = 1
     state.heading_known = 1
-    state.given_stamp = state.stamp
+    state.heading.given_stamp = state.stamp

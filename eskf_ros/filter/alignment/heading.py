@@ -39,7 +39,7 @@ def reset_heading(state, heading, std, settings):
     change = heading - heading_of(state, settings)
     turn_attitude(state, (change * up[0], change * up[1], change * up[2]))
     # The vehicle did not make this turn.
-    state.mag_heading = wrapped(state.mag_heading + change)
+    state.mag.heading = wrapped(state.mag.heading + change)
     covariance = state.covariance
     across = (
         (1.0 - up[0] * up[0], -up[0] * up[1], -up[0] * up[2]),
@@ -71,7 +71,7 @@ def search_heading(state, aid, gate, settings, work):
         first = 2
         local_to_ecef = local_east_north_up_to_ecef(state)
         velocity = rotate(local_to_ecef, (aid.payload[0], aid.payload[1], aid.payload[2]))
-        measured = rotate_back(state.map_to_ecef, velocity)
+        measured = rotate_back(state.frame.map_to_ecef, velocity)
         lever = rotate(rotation, cross(body_rate(state, rotation), arm))
     else:
         return
@@ -85,7 +85,7 @@ def search_with(state, first, measured, lever, gate, settings, work):
 
     ``measured`` in map, ``lever`` (or its velocity) in the axes of the unknown heading.
     """
-    if state.search_started == 1:
+    if state.search.started == 1:
         update_search(state, first, measured, lever, work.noise, gate, work)
     elif first == 0:
         reach = lever[0] ** 2 + lever[1] ** 2
@@ -107,7 +107,7 @@ def align_to_course(state, settings):
     """
     v = state.velocity_map
     speed = math.sqrt(v[0] ** 2 + v[1] ** 2)
-    if speed < settings.course_min_speed or state.search_started == 0:
+    if speed < settings.course_min_speed or state.search.started == 0:
         return
     along = (v[0] / speed, v[1] / speed)
     covariance = state.covariance
@@ -128,8 +128,8 @@ def align_to_course(state, settings):
     heading = math.atan2(v[1], v[0])
     turn = heading - heading_of(state, settings)
     cosine, sine = math.cos(turn), math.sin(turn)
-    ahead = cosine * state.search[COSINE] + sine * state.search[COSINE + 1]
-    aside = cosine * state.search[COSINE + 1] - sine * state.search[COSINE]
+    ahead = cosine * state.search.estimate[COSINE] + sine * state.search.estimate[COSINE + 1]
+    aside = cosine * state.search.estimate[COSINE + 1] - sine * state.search.estimate[COSINE]
     ahead_std, aside_std = spread(state, cosine, sine)
     if (
         abs(ahead) < max(CERTAIN * ahead_std, LEAST_LENGTH)
@@ -161,7 +161,7 @@ def reset_heading_from_memory(state, payload, settings):
     if math.sqrt(dot(way, way)) > reach + settings.remembered_place_tolerance + 3.0 * std:
         return
     f = settings.remembered_forward_ecef
-    forward = rotate_back(state.map_to_ecef, (f[0], f[1], f[2]))
+    forward = rotate_back(state.frame.map_to_ecef, (f[0], f[1], f[2]))
     reset_heading(state, math.atan2(forward[1], forward[0]), settings.remembered_heading_std, settings)
     state.heading_known = 1
-    state.given_stamp = state.stamp
+    state.heading.given_stamp = state.stamp

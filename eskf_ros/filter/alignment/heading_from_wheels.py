@@ -27,7 +27,7 @@ def search_with_wheels(state, payload, gate, settings, work):
     The velocity of the IMU on the map minus that of the wheels, turned by the unknown angle, is zero. Sideways the
     vehicle moves by no more than its course differs from its heading.
     """
-    if state.heading_known == 1 or state.search_started == 0 or settings.use_course == 0 or payload[3] < 0.0:
+    if state.heading_known == 1 or state.search.started == 0 or settings.use_course == 0 or payload[3] < 0.0:
         return
     if abs(payload[0]) < LEAST_SPEED:
         return

@@ -18,6 +18,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from eskf_ros.compiled import njit
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, GYRO_BIAS
 from eskf_ros.geodesy.earth import STANDARD_GRAVITY
@@ -25,6 +27,21 @@ from eskf_ros.geodesy.rotation import rotate
 
 SEARCH_SIZE = 10
 """States of the search for the heading (see ``heading_search``)."""
+
+SEARCH = np.dtype(
+    [
+        ("started", "i8"),
+        ("estimate", "f8", (SEARCH_SIZE,)),
+        ("covariance", "f8", (SEARCH_SIZE, SEARCH_SIZE)),
+        ("age", "f8"),
+    ],
+    align=True,
+)
+"""The search for the heading.
+
+``estimate``: position, velocity, cosine and sine, tilt and accelerometer bias as accelerations; ``age``: seconds
+since the last level.
+"""
 
 COSINE = 4
 TILT = 6
@@ -50,24 +67,24 @@ LENGTH_STD = 0.25
 @njit
 def forget_search(state):
     """Begin anew with the next fix."""
-    state.search_started = 0
+    state.search.started = 0
 
 
 @njit
 def begin_search(state, east, north, variance):
     """Begin at a fix (m, map) of that variance per axis; nothing is known of velocity and heading."""
     for i in range(TILT):
-        state.search[i] = 0.0
+        state.search.estimate[i] = 0.0
         for j in range(SEARCH_SIZE):
-            state.search_covariance[i, j] = 0.0
-            state.search_covariance[j, i] = 0.0
-    state.search[0] = east
-    state.search[1] = north
+            state.search.covariance[i, j] = 0.0
+            state.search.covariance[j, i] = 0.0
+    state.search.estimate[0] = east
+    state.search.estimate[1] = north
     for i in range(2):
-        state.search_covariance[i, i] = variance
-        state.search_covariance[2 + i, 2 + i] = START_VELOCITY_STD**2
-        state.search_covariance[COSINE + i, COSINE + i] = 0.5
-    state.search_started = 1
+        state.search.covariance[i, i] = variance
+        state.search.covariance[2 + i, 2 + i] = START_VELOCITY_STD**2
+        state.search.covariance[COSINE + i, COSINE + i] = 0.5
+    state.search.started = 1
 
 
 @njit
@@ -89,8 +106,8 @@ def note_level(state, tilt_variance, accel_bias_variance, rotation, settings):
 
     ``rotation``: from IMU to level axes. What is known of the bias already stays.
     """
-    x, p = state.search, state.search_covariance
-    if state.search_started == 0:
+    x, p = state.search.estimate, state.search.covariance
+    if state.search.started == 0:
         for i in range(BIAS, SEARCH_SIZE):
             x[i] = 0.0
             for j in range(SEARCH_SIZE):
@@ -108,7 +125,7 @@ def note_level(state, tilt_variance, accel_bias_variance, rotation, settings):
         p[i, TILT + 1] = -s * p[i, BIAS] - c * p[i, BIAS + 1]
     for i in range(TILT, BIAS):
         p[i, i] += STANDARD_GRAVITY**2 * tilt_variance + LEAST_ACCELERATION_STD**2
-    state.search_age = 0.0
+    state.search.age = 0.0
 
 
 @njit
@@ -117,9 +134,9 @@ def predict_search(state, acceleration, rotation, dt, settings):
 
     ``rotation``: from IMU to these axes.
     """
-    if state.search_started == 0:
+    if state.search.started == 0:
         return
-    x = state.search
+    x = state.search.estimate
     c, s, leaning = turn_of_body(rotation, settings)
     c, s = c * dt, s * dt
     a, b = acceleration[0] * dt, acceleration[1] * dt
@@ -127,7 +144,7 @@ def predict_search(state, acceleration, rotation, dt, settings):
         x[i] += dt * x[2 + i]
     x[2] += a * x[4] - b * x[5] + dt * x[6] + c * x[8] - s * x[9]
     x[3] += b * x[4] + a * x[5] + dt * x[7] + s * x[8] + c * x[9]
-    p = state.search_covariance
+    p = state.search.covariance
     for j in range(SEARCH_SIZE):
         p[0, j] += dt * p[2, j]
         p[1, j] += dt * p[3, j]
@@ -144,14 +161,14 @@ def predict_search(state, acceleration, rotation, dt, settings):
         gyro_variance = max(gyro_variance, state.covariance[GYRO_BIAS + i, GYRO_BIAS + i])
         accel_variance = max(accel_variance, state.covariance[ACCEL_BIAS + i, ACCEL_BIAS + i])
     # A constant rate error turns by its std times the age: variance std^2 age^2, of which this is the growth.
-    drift = settings.gyro_noise_density**2 + 2.0 * gyro_variance * state.search_age
+    drift = settings.gyro_noise_density**2 + 2.0 * gyro_variance * state.search.age
     velocity_noise = settings.accel_noise_density**2 + LEANING_TIME * leaning * accel_variance
     for i in range(2):
         p[2 + i, 2 + i] += velocity_noise * dt
         p[COSINE + i, COSINE + i] += drift * dt
         p[TILT + i, TILT + i] += STANDARD_GRAVITY**2 * drift * dt
         p[BIAS + i, BIAS + i] += settings.accel_bias_random_walk**2 * dt
-    state.search_age += dt
+    state.search.age += dt
 
 
 @njit
@@ -161,7 +178,7 @@ def update_search(state, first, measured, lever, noise, gate, work):
     ``lever`` is the antenna from the IMU (or its velocity), in the axes of the acceleration; ``noise`` (3, 3) in map
     axes; beyond ``gate`` in NIS nothing is fused.
     """
-    x, p = state.search, state.search_covariance
+    x, p = state.search.estimate, state.search.covariance
     # One row of H has the one, the cosine and the sine: measured = x[first] + lever turned by (cos, sin).
     h = ((lever[0], -lever[1]), (lever[1], lever[0]))
     innovation_e = measured[0] - x[first] - h[0][0] * x[4] - h[0][1] * x[5]
@@ -191,9 +208,9 @@ def update_search(state, first, measured, lever, noise, gate, work):
 @njit
 def turn_found(state):
     """Return the turn (rad) from the level axes to the map, and its standard deviation; infinite while undecided."""
-    if state.search_started == 0:
+    if state.search.started == 0:
         return 0.0, math.inf
-    c, s = state.search[COSINE], state.search[COSINE + 1]
+    c, s = state.search.estimate[COSINE], state.search.estimate[COSINE + 1]
     length = math.sqrt(c * c + s * s)
     if length < 0.5:
         return 0.0, math.inf
@@ -206,7 +223,7 @@ def turn_found(state):
 @njit
 def spread(state, cosine, sine):
     """Return the standard deviations of (cos, sin) along and across a direction."""
-    p = state.search_covariance
+    p = state.search.covariance
     cc, cs, ss = p[COSINE, COSINE], p[COSINE, COSINE + 1], p[COSINE + 1, COSINE + 1]
     along = cosine**2 * cc + 2.0 * cosine * sine * cs + sine**2 * ss
     across = sine**2 * cc - 2.0 * cosine * sine * cs + cosine**2 * ss

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.first_fix import START_VELOCITY_STD
 from eskf_ros.filter.alignment.heading import reset_heading
@@ -18,6 +20,26 @@ from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ERROR_SIZE, GYRO_BIAS, VELOCITY
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.geodesy.rotation import wrapped
+
+CANDIDATE = np.dtype(
+    [
+        ("candidate_rank", "i8"),
+        ("candidate_count", "i8"),
+        ("candidate_since", "i8"),
+        ("candidate_stamp", "i8"),
+        ("candidate_turn", "f8"),
+        ("candidate_std", "f8"),
+        ("given_stamp", "i8"),
+        ("disputed", "i8"),
+    ],
+    align=True,
+)
+"""What a sensor says of the unknown heading, and when a heading was given.
+
+``candidate_*``: rank of the sensor, how often it agreed with itself since when, its last message, by how much (rad) it
+would turn the attitude, and the standard deviation. ``given_stamp``: by parameter, from memory, or by a pose.
+``disputed``: the dual antenna contradicts it.
+"""
 
 DUAL_ANTENNA = 0
 MAGNETOMETER = 1
@@ -54,7 +76,7 @@ def update_unknown_heading(state, aid, settings, work):
     rank = MAGNETOMETER
     if aid.stream == Stream.HEADING:
         rank = DUAL_ANTENNA if aid.source == 0 else IMU_ORIENTATION
-    if rank == DUAL_ANTENNA and state.heading_disputed == 1:
+    if rank == DUAL_ANTENNA and state.heading.disputed == 1:
         return False
     turn, std = work.innovation[0], math.sqrt(work.noise[0, 0])
     if rank == DUAL_ANTENNA and settings.heading_offset_at < state.error_size:
@@ -68,31 +90,31 @@ def update_unknown_heading(state, aid, settings, work):
         return False
     reset_heading(state, heading_of(state, settings) + turn, OPEN_STD, settings)
     state.heading_known = 1
-    state.mag_heading = heading_of(state, settings)
+    state.mag.heading = heading_of(state, settings)
     return True
 
 
 @njit
 def update_heading_candidate(state, stamp, rank, turn, std, shortest_time):
     """Say whether enough messages in a row, this one the last, would turn the attitude alike (rad)."""
-    age = (stamp - state.hint_stamp) * 1e-9
-    if state.hint_count > 0 and rank > state.hint_rank and age < SILENCE:
+    age = (stamp - state.heading.candidate_stamp) * 1e-9
+    if state.heading.candidate_count > 0 and rank > state.heading.candidate_rank and age < SILENCE:
         return False
     bias_variance = 0.0
     for i in range(3):
         bias_variance = max(bias_variance, state.covariance[GYRO_BIAS + i, GYRO_BIAS + i])
     drift = math.sqrt(bias_variance) * age
-    tolerance = SIGMAS * math.sqrt(std**2 + state.hint_std**2 + drift**2)
-    is_other = abs(wrapped(turn - state.hint_turn)) > tolerance
-    if state.hint_count == 0 or rank != state.hint_rank or age > SILENCE or is_other:
-        state.hint_count = 0
-        state.hint_since = stamp
-    state.hint_rank = rank
-    state.hint_count += 1
-    state.hint_stamp = stamp
-    state.hint_turn = turn
-    state.hint_std = std
-    return state.hint_count >= MESSAGES and (stamp - state.hint_since) * 1e-9 >= shortest_time
+    tolerance = SIGMAS * math.sqrt(std**2 + state.heading.candidate_std**2 + drift**2)
+    is_other = abs(wrapped(turn - state.heading.candidate_turn)) > tolerance
+    if state.heading.candidate_count == 0 or rank != state.heading.candidate_rank or age > SILENCE or is_other:
+        state.heading.candidate_count = 0
+        state.heading.candidate_since = stamp
+    state.heading.candidate_rank = rank
+    state.heading.candidate_count += 1
+    state.heading.candidate_stamp = stamp
+    state.heading.candidate_turn = turn
+    state.heading.candidate_std = std
+    return state.heading.candidate_count >= MESSAGES and (stamp - state.heading.candidate_since) * 1e-9 >= shortest_time
 
 
 @njit
@@ -103,13 +125,16 @@ def update_refutation(state, aid, settings, work):
     better. So what was given holds only if the antennas are heard to agree with it, and not if those that were rejected
     from the beginning agree with each other.
     """
-    is_doubtful = state.given_stamp != NEVER and state.aid_fused_stamp[Stream.HEADING.value, 0] < state.given_stamp
+    is_doubtful = (
+        state.heading.given_stamp != NEVER
+        and state.streams.fused_stamp[Stream.HEADING.value, 0] < state.heading.given_stamp
+    )
     if not is_doubtful or aid.source != 0 or not aid.payload[3] > 0.0:
         return False
     std = math.sqrt(aid.payload[3])
     if not update_heading_candidate(state, aid.stamp, DUAL_ANTENNA, work.innovation[0], std, REFUTING_TIME):
         return False
-    return (state.hint_since - state.given_stamp) * 1e-9 < TRIAL_TIME
+    return (state.heading.candidate_since - state.heading.given_stamp) * 1e-9 < TRIAL_TIME
 
 
 @njit
@@ -119,10 +144,10 @@ def reset_given_heading(state, aid, settings, work):
     Then only motion decides, and the caller has to restart the alignment. The velocity, led astray meanwhile, is open.
     Returns whether the antennas have won.
     """
-    state.given_stamp = NEVER
-    state.hint_count = 0
-    if state.aid_fused_stamp[Stream.HEADING.value, 0] == NEVER:
-        state.heading_disputed = 1
+    state.heading.given_stamp = NEVER
+    state.heading.candidate_count = 0
+    if state.streams.fused_stamp[Stream.HEADING.value, 0] == NEVER:
+        state.heading.disputed = 1
         return False
     std = math.sqrt(aid.payload[3])
     if settings.heading_offset_at < state.error_size:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.heading import reset_heading
 from eskf_ros.filter.alignment.heading_search import note_level
@@ -15,6 +17,15 @@ from eskf_ros.filter.stationarity.residual_motion import can_be_bias, is_moving,
 from eskf_ros.filter.stationarity.static_window import Window
 from eskf_ros.geodesy.earth import EARTH_RATE, STANDARD_GRAVITY
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix, wrapped
+
+LEVELLING = np.dtype(
+    [
+        ("kept_gyro_bias", "f8", (3,)),
+        ("kept_gyro_variance", "f8"),
+    ],
+    align=True,
+)
+"""What was known of the gyro bias (rad/s) before the run of still windows, and its variance."""
 
 DRIFTED = 2.0
 """Levelling on the way is worth it when it makes the variance of the tilt smaller by this factor."""
@@ -32,14 +43,14 @@ def level(state, sums, count, interval, is_rest, settings):
     duration = count * interval
     force = (sums[0] / count, sums[1] / count, sums[2] / count)
     rate = (sums[3] / count, sums[4] / count, sums[5] / count)
-    is_first = count == state.window_count
+    is_first = count == state.window.samples
     if is_first:
         keep_gyro_bias(state)
     accel_bias, accel_variance, gyro_bias, gyro_variance = known_biases(state, force, rate, duration, is_rest, settings)
     if is_rest and not can_be_rest(state, rate, gyro_bias, gyro_variance, duration, settings):
         # What is not known to be rest has to wait as if it were motion.
-        state.still_stamp = NEVER
-        state.still_count = 0
+        state.window.still_stamp = NEVER
+        state.window.still_samples = 0
         if state.level_known == 1 or (state.stamp - state.first_stamp) * 1e-9 < settings.moving_start_after:
             return
         is_rest = False
@@ -64,8 +75,8 @@ def level(state, sums, count, interval, is_rest, settings):
     if state.level_known == 0 and state.restarts == 0 and not math.isnan(settings.initial_heading):
         state.heading_known = 1
         reset_heading(state, settings.initial_heading, settings.initial_heading_std, settings)
-        state.given_stamp = state.stamp
-    state.jump_heading += wrapped(heading_of(state, settings) - heading)
+        state.heading.given_stamp = state.stamp
+    state.odom.jump_heading += wrapped(heading_of(state, settings) - heading)
     state.level_known = 1
 
 
@@ -81,16 +92,16 @@ def known_biases(state, force, rate, duration, is_rest, settings):
         b, r = settings.remembered_accel_bias, settings.remembered_gyro_bias
         accel_bias, accel_variance = (b[0], b[1], b[2]), settings.remembered_accel_bias_std**2
         gyro_bias, gyro_variance = (r[0], r[1], r[2]), settings.remembered_gyro_bias_std**2
-    if state.kept_gyro_variance < gyro_variance:
-        b = state.kept_gyro_bias
-        gyro_bias, gyro_variance = (b[0], b[1], b[2]), state.kept_gyro_variance
+    if state.levelling.kept_gyro_variance < gyro_variance:
+        b = state.levelling.kept_gyro_bias
+        gyro_bias, gyro_variance = (b[0], b[1], b[2]), state.levelling.kept_gyro_variance
     return accel_bias, accel_variance, gyro_bias, gyro_variance
 
 
 @njit
 def can_be_rest(state, rate, gyro_bias, gyro_variance, duration, settings):
     """Say whether still readings are those of rest: no even braking, no slow turn, no bias that nobody expected."""
-    if state.moved_first == 1 or is_moving(state):
+    if state.residual.moved_first == 1 or is_moving(state):
         return False
     return can_be_bias(rate, gyro_bias, math.sqrt(gyro_variance), mean_rate_std(duration, settings))
 
@@ -108,7 +119,7 @@ def tilt_noise_at_rest(state, duration, strength, settings):
     A bias that walks differs at the end from its mean by a third of the variance that it walks meanwhile.
     """
     walked = settings.accel_bias_random_walk**2 * duration / 3.0
-    swayed = sway_left(state.sway_force, duration, settings)
+    swayed = sway_left(state.residual.force_variance, duration, settings)
     return (settings.accel_noise_density**2 / duration + walked + swayed) / strength**2
 
 
@@ -116,7 +127,7 @@ def tilt_noise_at_rest(state, duration, strength, settings):
 def is_level_better_known(state, variance):
     """Say whether a robot that sways has a level already that is better than the one it would get (rad2)."""
     known = max(state.covariance[ATTITUDE, ATTITUDE], state.covariance[ATTITUDE + 1, ATTITUDE + 1])
-    return state.sway_force > 0.0 and state.level_known == 1 and known < variance
+    return state.residual.force_variance > 0.0 and state.level_known == 1 and known < variance
 
 
 @njit
@@ -154,26 +165,26 @@ def reset_tilt(state, up, strength, accel_bias, accel_variance, tilt_noise, sett
 @njit
 def keep_gyro_bias(state):
     """Keep what is known of the gyro bias when a run of windows begins: the prior of what its windows say together."""
-    state.kept_gyro_variance = math.inf
+    state.levelling.kept_gyro_variance = math.inf
     if state.level_known == 0:
         return
-    state.kept_gyro_variance = 0.0
+    state.levelling.kept_gyro_variance = 0.0
     for i in range(3):
-        state.kept_gyro_bias[i] = state.gyro_bias[i]
+        state.levelling.kept_gyro_bias[i] = state.gyro_bias[i]
         variance = state.covariance[GYRO_BIAS + i, GYRO_BIAS + i]
-        state.kept_gyro_variance = max(state.kept_gyro_variance, variance)
+        state.levelling.kept_gyro_variance = max(state.levelling.kept_gyro_variance, variance)
 
 
 @njit
 def update_level(state, window, settings):
     """Level at the end of a static window (`Window`), at rest or, when that does not come, while moving."""
     if state.heading_known == 0 or state.position_known == 0:
-        interval = (state.stamp - state.window_start) * 1e-9 / state.window_count
+        interval = (state.stamp - state.window.start) * 1e-9 / state.window.samples
         if window == Window.REST:
-            state.still_stamp = state.stamp
-            level(state, state.still_sum, state.still_count, interval, True, settings)
+            state.window.still_stamp = state.stamp
+            level(state, state.window.still_total, state.window.still_samples, interval, True, settings)
         elif state.level_known == 0 and (state.stamp - state.first_stamp) * 1e-9 >= settings.moving_start_after:
-            level(state, state.window_sum, state.window_count, interval, False, settings)
+            level(state, state.window.total, state.window.samples, interval, False, settings)
     update_level_in_motion(state, settings)
 
 
@@ -183,14 +194,14 @@ def update_level_in_motion(state, settings):
 
     Of a robot that is never at rest the gyro bias is not known, and without a heading GNSS tells nothing of the tilt.
     """
-    if state.level_known == 0 or state.heading_known == 1 or state.still_stamp == state.stamp:
+    if state.level_known == 0 or state.heading_known == 1 or state.window.still_stamp == state.stamp:
         return
-    n = state.window_count
-    rate_square = (state.window_sum[3] ** 2 + state.window_sum[4] ** 2 + state.window_sum[5] ** 2) / n**2
+    n = state.window.samples
+    rate_square = (state.window.total[3] ** 2 + state.window.total[4] ** 2 + state.window.total[5] ** 2) / n**2
     fresh = settings.moving_tilt_std**2 + rate_square * (UNKNOWN_SPEED / STANDARD_GRAVITY) ** 2
     drifted = max(state.covariance[ATTITUDE, ATTITUDE], state.covariance[ATTITUDE + 1, ATTITUDE + 1])
     if drifted > DRIFTED * fresh:
-        level(state, state.window_sum, n, settings.static_duration / n, False, settings)
+        level(state, state.window.total, n, settings.static_duration / n, False, settings)
 
 
 @njit
@@ -210,15 +221,15 @@ def update_gyro_bias_at_rest(state, prior_bias, prior, mean_rate, up, duration, 
     rotation = to_matrix(state.attitude)
     noise = mean_rate_std(duration, settings) ** 2
     if is_rest:
-        noise += sway_left(state.sway_rate, duration, settings)
-    earth = state.earth_rate_map
+        noise += sway_left(state.residual.rate_variance, duration, settings)
+    earth = state.frame.earth_rate_map
     vertical_rate = dot(up, earth)
     horizontal_square = dot(earth, earth) - vertical_rate**2
     known = (vertical_rate * up[0], vertical_rate * up[1], vertical_rate * up[2])
     vertical_variance = noise
     # Of unknown direction: half of its square falls on each horizontal axis.
     horizontal_variance = noise + 0.5 * horizontal_square
-    if state.datum_known == 0:
+    if state.frame.datum_known == 0:
         vertical_variance = noise + EARTH_RATE**2
         horizontal_variance = noise + EARTH_RATE**2
     elif state.heading_known == 1:
@@ -252,8 +263,8 @@ def update_gyro_bias_at_rest(state, prior_bias, prior, mean_rate, up, duration, 
 @njit
 def reset_level_to_moving(state, settings):
     """Give tilt and gyro bias the uncertainty of a level taken while moving."""
-    state.still_stamp = NEVER
-    state.still_count = 0
+    state.window.still_stamp = NEVER
+    state.window.still_samples = 0
     note_level(state, settings.moving_tilt_std**2, settings.accel_bias_std**2, to_matrix(state.attitude), settings)
     up = local_up(state)
     covariance = state.covariance

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.covariance import transform_error
 from eskf_ros.filter.inertial.strapdown import gravity_map
@@ -22,22 +24,36 @@ from eskf_ros.geodesy.rotation import (
     to_rotation_vector,
 )
 
+FRAME = np.dtype(
+    [
+        ("datum", "f8", (3,)),
+        ("origin_ecef", "f8", (3,)),
+        ("map_to_ecef", "f8", (3, 3)),
+        ("earth_rate_map", "f8", (3,)),
+        ("datum_known", "i8"),
+    ],
+    align=True,
+)
+"""The map frame, valid once ``datum_known``: datum (rad, rad, m), its place (m) and axes in ECEF, the Earth rate
+(rad/s, map).
+"""
+
 
 @njit
 def set_datum(state, latitude, longitude, altitude):
     """Latch the local frame: East-North-Up at a geodetic position (rad, rad, m)."""
-    state.datum[0] = latitude
-    state.datum[1] = longitude
-    state.datum[2] = altitude
+    state.frame.datum[0] = latitude
+    state.frame.datum[1] = longitude
+    state.frame.datum[2] = altitude
     origin = geodetic_to_ecef(latitude, longitude, altitude)
     rotation = east_north_up_to_ecef(latitude, longitude)
     earth_rate = rotate_back(rotation, (0.0, 0.0, EARTH_RATE))
     for i in range(3):
-        state.origin_ecef[i] = origin[i]
-        state.earth_rate_map[i] = earth_rate[i]
+        state.frame.origin_ecef[i] = origin[i]
+        state.frame.earth_rate_map[i] = earth_rate[i]
         for j in range(3):
-            state.map_to_ecef[i, j] = rotation[i][j]
-    state.datum_known = 1
+            state.frame.map_to_ecef[i, j] = rotation[i][j]
+    state.frame.datum_known = 1
 
 
 @njit
@@ -62,17 +78,21 @@ def turn_attitude(state, rotation_vector):
 @njit
 def move_datum(state, latitude, longitude, altitude, settings):
     """Describe the same state in the local frame of another datum (rad, rad, m): an exact rotation and shift."""
-    old = east_north_up_to_ecef(state.datum[0], state.datum[1])
+    old = east_north_up_to_ecef(state.frame.datum[0], state.frame.datum[1])
     offset = rotate(old, state.position_map)
-    ecef = (state.origin_ecef[0] + offset[0], state.origin_ecef[1] + offset[1], state.origin_ecef[2] + offset[2])
+    ecef = (
+        state.frame.origin_ecef[0] + offset[0],
+        state.frame.origin_ecef[1] + offset[1],
+        state.frame.origin_ecef[2] + offset[2],
+    )
     set_datum(state, latitude, longitude, altitude)
-    origin = state.origin_ecef
+    origin = state.frame.origin_ecef
     # Columns of the rotation from old to new map, as rows: the images of the old axes.
-    east = rotate_back(state.map_to_ecef, (old[0][0], old[1][0], old[2][0]))
-    north = rotate_back(state.map_to_ecef, (old[0][1], old[1][1], old[2][1]))
-    up = rotate_back(state.map_to_ecef, (old[0][2], old[1][2], old[2][2]))
+    east = rotate_back(state.frame.map_to_ecef, (old[0][0], old[1][0], old[2][0]))
+    north = rotate_back(state.frame.map_to_ecef, (old[0][1], old[1][1], old[2][1]))
+    up = rotate_back(state.frame.map_to_ecef, (old[0][2], old[1][2], old[2][2]))
     turn = ((east[0], north[0], up[0]), (east[1], north[1], up[1]), (east[2], north[2], up[2]))
-    position = rotate_back(state.map_to_ecef, (ecef[0] - origin[0], ecef[1] - origin[1], ecef[2] - origin[2]))
+    position = rotate_back(state.frame.map_to_ecef, (ecef[0] - origin[0], ecef[1] - origin[1], ecef[2] - origin[2]))
     velocity = rotate(turn, state.velocity_map)
     for i in range(3):
         state.position_map[i] = position[i]
@@ -110,9 +130,11 @@ def shortest_turn(a, b):
 @njit
 def local_east_north_up_to_ecef(state):
     """Return the rotation from East-North-Up at the current position to ECEF."""
-    offset = rotate(state.map_to_ecef, state.position_map)
+    offset = rotate(state.frame.map_to_ecef, state.position_map)
     geodetic = ecef_to_geodetic(
-        state.origin_ecef[0] + offset[0], state.origin_ecef[1] + offset[1], state.origin_ecef[2] + offset[2]
+        state.frame.origin_ecef[0] + offset[0],
+        state.frame.origin_ecef[1] + offset[1],
+        state.frame.origin_ecef[2] + offset[2],
     )
     return east_north_up_to_ecef(geodetic[0], geodetic[1])
 
@@ -120,7 +142,7 @@ def local_east_north_up_to_ecef(state):
 @njit
 def body_rate(state, rotation):
     """Return the body rate relative to the Earth (rad/s, body axes)."""
-    earth = rotate_back(rotation, state.earth_rate_map)
+    earth = rotate_back(rotation, state.frame.earth_rate_map)
     return (
         state.angular_rate[0] - state.gyro_bias[0] - earth[0],
         state.angular_rate[1] - state.gyro_bias[1] - earth[1],

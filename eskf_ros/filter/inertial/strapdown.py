@@ -11,6 +11,8 @@ coning and sculling; Savage, Strapdown Analytics, ch. 7; Groves, sections 5.5 an
 
 from __future__ import annotations
 
+import numpy as np
+
 from eskf_ros.compiled import njit
 from eskf_ros.geodesy.earth import STANDARD_GRAVITY, normal_gravity_ecef
 from eskf_ros.geodesy.rotation import (
@@ -23,17 +25,32 @@ from eskf_ros.geodesy.rotation import (
     to_matrix,
 )
 
+IMU_READINGS = np.dtype(
+    [
+        ("stamp", "i8"),
+        ("interval", "f8"),
+        ("force", "f8", (3,)),
+        ("rate", "f8", (3,)),
+        ("earlier_force", "f8", (3,)),
+        ("earlier_rate", "f8", (3,)),
+    ],
+    align=True,
+)
+"""The last raw IMU reading (m/s2, rad/s), its stamp, the interval (s) that it ended, and the reading before."""
+
 
 @njit
 def gravity_map(state, position_map):
     """Return normal gravity (m/s2, map axes) at a map position (m); straight down while there is no datum."""
-    if state.datum_known == 0:
+    if state.frame.datum_known == 0:
         return (0.0, 0.0, -STANDARD_GRAVITY)
-    offset = rotate(state.map_to_ecef, position_map)
+    offset = rotate(state.frame.map_to_ecef, position_map)
     gravity = normal_gravity_ecef(
-        state.origin_ecef[0] + offset[0], state.origin_ecef[1] + offset[1], state.origin_ecef[2] + offset[2]
+        state.frame.origin_ecef[0] + offset[0],
+        state.frame.origin_ecef[1] + offset[1],
+        state.frame.origin_ecef[2] + offset[2],
     )
-    return rotate_back(state.map_to_ecef, gravity)
+    return rotate_back(state.frame.map_to_ecef, gravity)
 
 
 @njit
@@ -94,7 +111,7 @@ def propagate_nominal_state(state, force_0, rate_0, force_1, rate_1, dt, couplin
     )
     p = state.position_map
     v = state.velocity_map
-    earth_rate = state.earth_rate_map
+    earth_rate = state.frame.earth_rate_map
     attitude = (state.attitude[0], state.attitude[1], state.attitude[2], state.attitude[3])
     middle = to_matrix(normalized(half_turned(attitude, angle)))
     dv = rotate(middle, velocity_increment)

@@ -11,11 +11,42 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from eskf_ros.compiled import njit
 from eskf_ros.filter.measurements.gnss_position import noise_factor
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import POSITION, SOURCES
 from eskf_ros.filter.state.time import NEVER
+
+FIX_TRACKER = np.dtype(
+    [
+        ("corrections_map", "f8", (3,)),
+        ("stamp", "i8", (SOURCES,)),
+        ("offset", "f8", (SOURCES, 3)),
+        ("rate", "f8", (SOURCES, 3)),
+        ("offset_variance", "f8", (SOURCES, 3)),
+        ("mixed_variance", "f8", (SOURCES, 3)),
+        ("rate_variance", "f8", (SOURCES, 3)),
+        ("misses", "i8", (SOURCES,)),
+        ("hit_stamp", "i8", (SOURCES,)),
+        ("jumps", "i8", (SOURCES,)),
+        ("jump", "f8", (SOURCES,)),
+        ("rejected", "i8", (SOURCES,)),
+        ("rejected_since", "i8", (SOURCES,)),
+        ("scatter", "f8", (SOURCES,)),
+        ("scatter_paid", "f8", (SOURCES,)),
+        ("velocity_lead", "f8", (SOURCES, 3)),
+        ("velocity_lead_variance", "f8", (SOURCES, 3)),
+    ],
+    align=True,
+)
+"""The track of the fixes by receiver: where they are (m) and move (m/s) beside the reckoned position.
+
+The reckoned position is the position without any correction (``corrections_map``). Variances per axis; misses and
+rejected fixes, jumps (m). ``scatter``: of the fixes against what they claim. ``velocity_lead``: how far the velocities
+of the receiver lead away from the reckoned position (m), and how well that is known.
+"""
 
 SHORTEST_PATIENCE = 1_000_000_000
 LONGEST_PATIENCE = 30_000_000_000
@@ -59,28 +90,28 @@ CONTRADICTION_RATE = 0.3
 @njit
 def patience(state, stream, source):
     """Return how long (ns) an aid may be silent."""
-    usual = MISSED_INTERVALS * state.aid_interval[stream, source]
+    usual = MISSED_INTERVALS * state.streams.interval[stream, source]
     return min(max(usual, SHORTEST_PATIENCE), LONGEST_PATIENCE)
 
 
 @njit
 def is_live(state, stream, source):
     """Say whether measurements of an aid come, accepted or not."""
-    last = state.aid_stamp[stream, source]
+    last = state.streams.last_stamp[stream, source]
     return last != NEVER and state.stamp - last <= patience(state, stream, source)
 
 
 @njit
 def is_fusing(state, stream, source):
     """Say whether measurements of an aid are accepted."""
-    last = state.aid_fused_stamp[stream, source]
+    last = state.streams.fused_stamp[stream, source]
     return last != NEVER and state.stamp - last <= patience(state, stream, source)
 
 
 @njit
 def is_led(state, source):
     """Say whether velocities of a receiver come often enough to lead the track of its fixes."""
-    last = state.aid_stamp[Stream.GNSS_VELOCITY.value, source]
+    last = state.streams.last_stamp[Stream.GNSS_VELOCITY.value, source]
     return last != NEVER and state.stamp - last <= LONGEST_LEAD
 
 
@@ -99,85 +130,85 @@ def take_velocity(state, source, work):
     if not is_led(state, source):
         forget_rate(state, source)
         return
-    dt = (state.stamp - state.aid_stamp[Stream.GNSS_VELOCITY.value, source]) * 1e-9
+    dt = (state.stamp - state.streams.last_stamp[Stream.GNSS_VELOCITY.value, source]) * 1e-9
     for i in range(3):
-        state.velocity_lead[source, i] += work.innovation[i] * dt
-        state.velocity_lead_variance[source, i] += work.noise[i, i] * dt * dt
+        state.tracker.velocity_lead[source, i] += work.innovation[i] * dt
+        state.tracker.velocity_lead_variance[source, i] += work.noise[i, i] * dt * dt
 
 
 @njit
 def take_fix(state, source, work):
     """Let the track take a fix, if it belongs to it."""
-    last = state.track_stamp[source]
+    last = state.tracker.stamp[source]
     if last == NEVER or state.stamp - last > patience(state, Stream.GNSS_POSITION.value, source):
         start_track(state, source, work)
         return
     nis = predict_track(state, source, work)
     inflate_position_for_scatter(state, source, nis, work)
     if not nis <= MISS_GATE:
-        state.track_misses[source] += 1
-        if state.track_misses[source] >= MISSES:
+        state.tracker.misses[source] += 1
+        if state.tracker.misses[source] >= MISSES:
             note_jump_of_fixes(state, source, work)
             start_track(state, source, work)
         return
-    state.track_misses[source] = 0
-    state.track_hit_stamp[source] = state.stamp
+    state.tracker.misses[source] = 0
+    state.tracker.hit_stamp[source] = state.stamp
     for i in range(3):
-        variance, mixed = state.track_offset_variance[source, i], state.track_mixed_variance[source, i]
-        excess = offset_of_fix(state, source, i, work) - state.track_offset[source, i]
+        variance, mixed = state.tracker.offset_variance[source, i], state.tracker.mixed_variance[source, i]
+        excess = offset_of_fix(state, source, i, work) - state.tracker.offset[source, i]
         gain = variance / (variance + work.noise[i, i])
         rate_gain = mixed / (variance + work.noise[i, i])
-        state.track_offset[source, i] += gain * excess
-        state.track_rate[source, i] += rate_gain * excess
-        state.track_offset_variance[source, i] -= gain * variance
-        state.track_mixed_variance[source, i] -= gain * mixed
-        state.track_rate_variance[source, i] -= rate_gain * mixed
+        state.tracker.offset[source, i] += gain * excess
+        state.tracker.rate[source, i] += rate_gain * excess
+        state.tracker.offset_variance[source, i] -= gain * variance
+        state.tracker.mixed_variance[source, i] -= gain * mixed
+        state.tracker.rate_variance[source, i] -= rate_gain * mixed
 
 
 @njit
 def predict_track(state, source, work):
     """Bring the track to the stamp of the newest fix; return the fix's normalised innovation squared."""
-    dt = (state.stamp - state.track_stamp[source]) * 1e-9
-    state.track_stamp[source] = state.stamp
+    dt = (state.stamp - state.tracker.stamp[source]) * 1e-9
+    state.tracker.stamp[source] = state.stamp
     density = RATE_NOISE_DENSITY if is_led(state, source) else INERTIAL_NOISE_DENSITY
     noise = density**2 * dt
     nis = 0.0
     for i in range(3):
-        mixed, rate = state.track_mixed_variance[source, i], state.track_rate_variance[source, i]
-        state.track_offset[source, i] += dt * state.track_rate[source, i]
-        state.track_offset_variance[source, i] += dt * (2.0 * mixed + dt * rate) + noise * dt * dt / 3.0
-        state.track_offset_variance[source, i] += state.velocity_lead_variance[source, i]
-        state.track_mixed_variance[source, i] += dt * rate + 0.5 * noise * dt
-        state.track_rate_variance[source, i] += noise
-        state.velocity_lead_variance[source, i] = 0.0
-        excess = offset_of_fix(state, source, i, work) - state.track_offset[source, i]
-        nis += excess * excess / (state.track_offset_variance[source, i] + work.noise[i, i])
+        mixed, rate = state.tracker.mixed_variance[source, i], state.tracker.rate_variance[source, i]
+        state.tracker.offset[source, i] += dt * state.tracker.rate[source, i]
+        state.tracker.offset_variance[source, i] += dt * (2.0 * mixed + dt * rate) + noise * dt * dt / 3.0
+        state.tracker.offset_variance[source, i] += state.tracker.velocity_lead_variance[source, i]
+        state.tracker.mixed_variance[source, i] += dt * rate + 0.5 * noise * dt
+        state.tracker.rate_variance[source, i] += noise
+        state.tracker.velocity_lead_variance[source, i] = 0.0
+        excess = offset_of_fix(state, source, i, work) - state.tracker.offset[source, i]
+        nis += excess * excess / (state.tracker.offset_variance[source, i] + work.noise[i, i])
     return nis
 
 
 @njit
 def offset_of_fix(state, source, i, work):
     """Return how far the newest fix is from the reckoned position that the velocities lead (m, axis ``i`` of map)."""
-    return work.innovation[i] + state.corrections_map[i] - state.velocity_lead[source, i]
+    return work.innovation[i] + state.tracker.corrections_map[i] - state.tracker.velocity_lead[source, i]
 
 
 @njit
 def offset_of_track(state, source, i):
     """Return how far the track is from the position of the state (m, axis ``i`` of map)."""
-    return state.track_offset[source, i] + state.velocity_lead[source, i] - state.corrections_map[i]
+    return state.tracker.offset[source, i] + state.tracker.velocity_lead[source, i] - state.tracker.corrections_map[i]
 
 
 @njit
 def start_track(state, source, work):
     """Start the track of a receiver anew from its newest fix."""
-    state.track_stamp[source] = state.stamp
-    state.track_hit_stamp[source] = state.stamp
-    state.track_misses[source] = 0
-    state.track_rejected[source] = 0
+    state.tracker.stamp[source] = state.stamp
+    state.tracker.hit_stamp[source] = state.stamp
+    state.tracker.misses[source] = 0
+    state.tracker.rejected[source] = 0
     for i in range(3):
-        state.track_offset[source, i] = offset_of_fix(state, source, i, work)
-        state.track_offset_variance[source, i] = work.noise[i, i]
-        state.velocity_lead_variance[source, i] = 0.0
+        state.tracker.offset[source, i] = offset_of_fix(state, source, i, work)
+        state.tracker.offset_variance[source, i] = work.noise[i, i]
+        state.tracker.velocity_lead_variance[source, i] = 0.0
     forget_rate(state, source)
 
 
@@ -185,30 +216,30 @@ def start_track(state, source, work):
 def forget_rate(state, source):
     """Begin again with the rate of the track."""
     for i in range(3):
-        state.track_rate[source, i] = 0.0
-        state.track_mixed_variance[source, i] = 0.0
-        state.track_rate_variance[source, i] = UNKNOWN_RATE_STD**2
+        state.tracker.rate[source, i] = 0.0
+        state.tracker.mixed_variance[source, i] = 0.0
+        state.tracker.rate_variance[source, i] = UNKNOWN_RATE_STD**2
 
 
 @njit
 def note_jump_of_fixes(state, source, work):
     """Count a step aside of fixes that came without a break, with velocities that know nothing of it."""
-    if is_led(state, source) and state.stamp - state.track_hit_stamp[source] < UNBROKEN:
+    if is_led(state, source) and state.stamp - state.tracker.hit_stamp[source] < UNBROKEN:
         square = 0.0
         for i in range(3):
-            square += (offset_of_fix(state, source, i, work) - state.track_offset[source, i]) ** 2
+            square += (offset_of_fix(state, source, i, work) - state.tracker.offset[source, i]) ** 2
         if square > LEAST_JUMP**2:
-            state.track_jumps[source] += 1
-            state.track_jump[source] = max(state.track_jump[source], math.sqrt(square))
+            state.tracker.jumps[source] += 1
+            state.tracker.jump[source] = max(state.tracker.jump[source], math.sqrt(square))
 
 
 @njit
 def forget_tracks(state):
     """Forget what the fixes were like: the map or the state is another one."""
     for source in range(SOURCES):
-        state.track_stamp[source] = NEVER
-        state.track_misses[source] = 0
-        state.track_rejected[source] = 0
+        state.tracker.stamp[source] = NEVER
+        state.tracker.misses[source] = 0
+        state.tracker.rejected[source] = 0
 
 
 @njit
@@ -220,19 +251,19 @@ def inflate_position_for_scatter(state, source, nis, work):
     by as much as a fix is.
     """
     for i in range(3):
-        if state.track_offset_variance[source, i] > SCATTER_SHARE * work.noise[i, i]:
+        if state.tracker.offset_variance[source, i] > SCATTER_SHARE * work.noise[i, i]:
             return
-    scatter = state.scatter[source]
+    scatter = state.tracker.scatter[source]
     factor = noise_factor(state, source)
     found = min(factor * nis / 3.0, SCATTER_CLIP * max(scatter, 1.0))
-    state.scatter[source] += SCATTER_GAIN * (found - scatter)
-    paid = state.scatter_paid[source]
+    state.tracker.scatter[source] += SCATTER_GAIN * (found - scatter)
+    paid = state.tracker.scatter_paid[source]
     if factor == 1.0:
-        state.scatter_paid[source] = 1.0
+        state.tracker.scatter_paid[source] = 1.0
     elif factor > SCATTER_GROWTH * paid:
         for i in range(3):
             state.covariance[POSITION + i, POSITION + i] += (1.0 - paid / factor) * work.noise[i, i]
-        state.scatter_paid[source] = factor
+        state.tracker.scatter_paid[source] = factor
 
 
 @njit
@@ -243,7 +274,7 @@ def is_contradicted(state, source):
     square = 0.0
     nis = 0.0
     for i in range(3):
-        rate = state.track_rate[source, i]
+        rate = state.tracker.rate[source, i]
         square += rate * rate
-        nis += rate * rate / state.track_rate_variance[source, i]
+        nis += rate * rate / state.tracker.rate_variance[source, i]
     return nis > CONTRADICTION_SIGMAS**2 and square > CONTRADICTION_RATE**2

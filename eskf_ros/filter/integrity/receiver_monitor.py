@@ -29,6 +29,37 @@ from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, 
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.geodesy.rotation import cross, rotate, to_matrix
 
+RECEIVER_MONITOR = np.dtype(
+    [
+        ("fault_stamp", "i8"),
+        ("fault_force", "f8", (3,)),
+        ("fault_absorbed", "f8", (SOURCES, ERROR_SIZE, 4)),
+        ("fault_information", "f8", (SOURCES, 4, 4)),
+        ("fault_evidence", "f8", (SOURCES, 4)),
+        ("drift_sums", "f8", (SOURCES, 4)),
+        ("departures", "i8", (SOURCES,)),
+        ("departure_stamp", "i8", (SOURCES,)),
+        ("seen_stamp", "i8", (SOURCES,)),
+        ("fix_count", "i8", (SOURCES,)),
+        ("scattered_fixes", "i8", (SOURCES,)),
+        ("scatter_sum", "f8", (SOURCES,)),
+        ("contradicted_fixes", "i8", (SOURCES,)),
+        ("contradiction_rate", "f8", (SOURCES,)),
+        ("velocity_nis", "f8", (SOURCES, 2)),
+        ("coasts", "i8"),
+        ("coast_nis", "f8"),
+        ("heading_mark_stamp", "i8"),
+        ("heading_mark_std", "f8"),
+        ("heading_stuck", "i8"),
+    ],
+    align=True,
+)
+"""Monitors of the GNSS receivers.
+
+``fault_*``: effect of faults on the state so far, and normal equations; ``drift_sums``: innovations up and down on two
+axes; ``departures`` and the rest: counts, means and sums.
+"""
+
 FAULTS = 4
 TIME = 3
 """Three axes of the lever arm (m, body), and the time offset (s)."""
@@ -116,14 +147,14 @@ def write_effect(state, aid, work, settings):
 def learn_faults(state, aid, size, gate, work, settings):
     """Follow what faults have done to the state, and compare the innovation with what is left of them."""
     if state.heading_known == 0:
-        state.fault_stamp = NEVER
+        state.receiver.fault_stamp = NEVER
         return
-    if state.fault_stamp == NEVER:
-        state.fault_absorbed[:] = 0.0
+    if state.receiver.fault_stamp == NEVER:
+        state.receiver.fault_absorbed[:] = 0.0
     dt = carry_absorbed(state)
     accepted = aid.verdict in (Verdict.FUSED, Verdict.WEIGHED_DOWN)
     for source in range(SOURCES):
-        absorbed = state.fault_absorbed[source]
+        absorbed = state.receiver.fault_absorbed[source]
         write_effect(state, aid, work, settings)
         effect = work.effect
         is_own = source == aid.source and aid.stream in (Stream.GNSS_POSITION, Stream.GNSS_VELOCITY)
@@ -156,11 +187,11 @@ def carry_absorbed(state):
     rotation = to_matrix(state.attitude)
     f, b = state.specific_force, state.accel_bias
     force = rotate(rotation, (f[0] - b[0], f[1] - b[1], f[2] - b[2]))
-    dt = 0.0 if state.fault_stamp == NEVER else (state.stamp - state.fault_stamp) * 1e-9
-    last = state.fault_force
+    dt = 0.0 if state.receiver.fault_stamp == NEVER else (state.stamp - state.receiver.fault_stamp) * 1e-9
+    last = state.receiver.fault_force
     mean = (0.5 * (force[0] + last[0]), 0.5 * (force[1] + last[1]), 0.5 * (force[2] + last[2]))
     for source in range(SOURCES):
-        a = state.fault_absorbed[source]
+        a = state.receiver.fault_absorbed[source]
         for k in range(FAULTS):
             turning = rotate(rotation, (a[GYRO_BIAS, k], a[GYRO_BIAS + 1, k], a[GYRO_BIAS + 2, k]))
             pulling = rotate(rotation, (a[ACCEL_BIAS, k], a[ACCEL_BIAS + 1, k], a[ACCEL_BIAS + 2, k]))
@@ -175,9 +206,9 @@ def carry_absorbed(state):
                 a[POSITION + i, k] += dt * (a[VELOCITY + i, k] + 0.5 * gain)
                 a[VELOCITY + i, k] += gain
                 a[ATTITUDE + i, k] -= dt * turning[i]
-    state.fault_stamp = state.stamp
+    state.receiver.fault_stamp = state.stamp
     for i in range(3):
-        state.fault_force[i] = force[i]
+        state.receiver.fault_force[i] = force[i]
     return dt
 
 
@@ -187,43 +218,43 @@ def weigh_faults(state, source, dt, weight, work):
     inverse, effect = work.innovation_covariance, work.effect
     remains = max(0.0, 1.0 - dt / MEMORY)
     for k in range(FAULTS):
-        state.fault_evidence[source, k] *= remains
+        state.receiver.fault_evidence[source, k] *= remains
         for m in range(FAULTS):
-            state.fault_information[source, k, m] *= remains
+            state.receiver.fault_information[source, k, m] *= remains
         for a in range(3):
             spread = 0.0
             for b in range(3):
                 spread += effect[b, k] * inverse[b, a]
-            state.fault_evidence[source, k] += weight * spread * work.innovation[a]
+            state.receiver.fault_evidence[source, k] += weight * spread * work.innovation[a]
             for m in range(FAULTS):
-                state.fault_information[source, k, m] += weight * spread * effect[a, m]
+                state.receiver.fault_information[source, k, m] += weight * spread * effect[a, m]
 
 
 @njit
 def watch_fix(state, aid):
     """Count fixes that claim too much, contradict the velocities, or come after an outage."""
     source = aid.source
-    state.fix_count[source] += 1
-    if NEVER < state.seen_stamp[source] < state.stamp - LONG_COAST and state.heading_known == 1:
-        state.coasts += 1
-        state.coast_nis += min(aid.nis / 3.0, NIS_CLIP**2)
-    state.seen_stamp[source] = state.stamp
+    state.receiver.fix_count[source] += 1
+    if NEVER < state.receiver.seen_stamp[source] < state.stamp - LONG_COAST and state.heading_known == 1:
+        state.receiver.coasts += 1
+        state.receiver.coast_nis += min(aid.nis / 3.0, NIS_CLIP**2)
+    state.receiver.seen_stamp[source] = state.stamp
     factor = noise_factor(state, source)
     if factor > 1.0:
-        state.scattered_fixes[source] += 1
-        state.scatter_sum[source] += factor
+        state.receiver.scattered_fixes[source] += 1
+        state.receiver.scatter_sum[source] += factor
     if aid.verdict == Verdict.CONTRADICTED:
-        rate = state.track_rate[source]
-        state.contradicted_fixes[source] += 1
+        rate = state.tracker.rate[source]
+        state.receiver.contradicted_fixes[source] += 1
         speed = math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
-        state.contradiction_rate[source] = max(state.contradiction_rate[source], speed)
+        state.receiver.contradiction_rate[source] = max(state.receiver.contradiction_rate[source], speed)
 
 
 @njit
 def watch_velocity(state, aid):
     """Keep the mean of the normalised innovations squared of the velocities."""
     nis = min(aid.nis / 3.0, NIS_CLIP)
-    sums = state.velocity_nis[aid.source]
+    sums = state.receiver.velocity_nis[aid.source]
     sums[0] += NIS_GAIN * (nis - sums[0])
     sums[1] += 1.0
 
@@ -234,7 +265,7 @@ def watch_departure(state, source, work):
 
     Of the velocities, where there are any: errors of fixes are alike for seconds.
     """
-    sums = state.drift_sums[source]
+    sums = state.receiver.drift_sums[source]
     for i in range(2):
         # The diagonal of the inverse is at most the inverse of the diagonal.
         sigmas = work.innovation[i] * math.sqrt(work.innovation_covariance[i, i])
@@ -243,30 +274,30 @@ def watch_departure(state, source, work):
         sums[2 * i + 1] = max(0.0, sums[2 * i + 1] - sigmas - DRIFT_ALLOWANCE)
     if max(max(sums[0], sums[1]), max(sums[2], sums[3])) >= DRIFT_LIMIT:
         sums[:] = 0.0
-        if state.departures[source] == 0:
-            state.departure_stamp[source] = state.stamp
-        state.departures[source] += 1
+        if state.receiver.departures[source] == 0:
+            state.receiver.departure_stamp[source] = state.stamp
+        state.receiver.departures[source] += 1
 
 
 @njit
 def watch_heading_std(state, settings):
     """Look every minute whether the heading has become better while the robot moved."""
-    if state.stamp - state.heading_mark_stamp < HEADING_INTERVAL:
+    if state.stamp - state.receiver.heading_mark_stamp < HEADING_INTERVAL:
         return
     std = math.sqrt(state.covariance[ATTITUDE + 2, ATTITUDE + 2]) if state.heading_known == 1 else math.pi
-    is_moving = state.motion_stamp > state.stamp - HEADING_INTERVAL // 2
-    stuck = is_moving and std > settings.good_heading_std and std > SHRINKING * state.heading_mark_std
-    if state.heading_mark_stamp != NEVER:
-        state.heading_stuck = state.heading_stuck + 1 if stuck else 0
-    state.heading_mark_stamp = state.stamp
-    state.heading_mark_std = std
+    is_moving = state.window.motion_stamp > state.stamp - HEADING_INTERVAL // 2
+    stuck = is_moving and std > settings.good_heading_std and std > SHRINKING * state.receiver.heading_mark_std
+    if state.receiver.heading_mark_stamp != NEVER:
+        state.receiver.heading_stuck = state.receiver.heading_stuck + 1 if stuck else 0
+    state.receiver.heading_mark_stamp = state.stamp
+    state.receiver.heading_mark_std = std
 
 
 def aid_complaints(state: np.void, settings: np.void) -> list[str]:
     """Say in one sentence each what is wrong with the receivers, and what to do; empty when nothing is."""
     found = []
     for source in range(SOURCES):
-        if state["fix_count"][source] < MANY_FIXES:
+        if state["receiver"]["fix_count"][source] < MANY_FIXES:
             continue
         faults = _fault_complaints(state, settings, source)
         lies = _covariance_complaints(state, source, float(settings["gnss_covariance_scale"]))
@@ -275,11 +306,11 @@ def aid_complaints(state: np.void, settings: np.void) -> list[str]:
         if not faults and not lies:
             found += _path_complaints(state, source)
             found += _velocity_complaints(state, source) + _departure_complaints(state, source)
-    if state["resets"]:
+    if state["recovery"]["resets"]:
         cause = "" if found else ": IMU noise parameters too small, or multipath for many seconds"
         found.append(
-            f"{int(state['resets'])} times fixes that agree with each other contradicted the filter for so long that "
-            f"position and velocity were reset to them{cause}"
+            f"{int(state['recovery']['resets'])} times fixes that agree with each other contradicted the filter for so "
+            f"long that position and velocity were reset to them{cause}"
         )
     return found + _coast_complaints(state) + _heading_complaints(state)
 
@@ -293,11 +324,15 @@ def estimated_faults(state: np.void, source: int) -> tuple[np.ndarray, np.ndarra
 
     Innovations that are larger than expected make them less certain.
     """
-    scattered = max(1, int(state["scattered_fixes"][source]))
-    excess = max(1.0, float(state["velocity_nis"][source, 0]), float(state["scatter_sum"][source]) / scattered)
-    information = state["fault_information"][source] + np.diag(1.0 / np.square(FAULT_PRIOR))
+    scattered = max(1, int(state["receiver"]["scattered_fixes"][source]))
+    excess = max(
+        1.0,
+        float(state["receiver"]["velocity_nis"][source, 0]),
+        float(state["receiver"]["scatter_sum"][source]) / scattered,
+    )
+    information = state["receiver"]["fault_information"][source] + np.diag(1.0 / np.square(FAULT_PRIOR))
     covariance = np.linalg.inv(information) * excess
-    estimate = np.linalg.solve(information, state["fault_evidence"][source])
+    estimate = np.linalg.solve(information, state["receiver"]["fault_evidence"][source])
     return estimate, np.sqrt(np.diagonal(covariance))
 
 
@@ -328,14 +363,14 @@ def _fault_complaints(state: np.void, settings: np.void, source: int) -> list[st
 
 
 def _covariance_complaints(state: np.void, source: int, scale: float) -> list[str]:
-    count, scattered = int(state["fix_count"][source]), int(state["scattered_fixes"][source])
+    count, scattered = int(state["receiver"]["fix_count"][source]), int(state["receiver"]["scattered_fixes"][source])
     if scattered > max(MANY_FIXES, count // 20):
-        factor = float(state["scatter_sum"][source]) / scattered
+        factor = float(state["receiver"]["scatter_sum"][source]) / scattered
         return [
             f"the fixes{_of(source)} scatter {math.sqrt(factor):.1f} times as much as they claim ({scattered} of "
             f"{count}): set gnss.covariance_scale to {factor * scale:.2g}, or gnss.position_std_floor"
         ]
-    share = math.sqrt(float(state["scatter"][source]))
+    share = math.sqrt(float(state["tracker"]["scatter"][source]))
     if share < MODEST_SCATTER:
         return [
             f"the fixes{_of(source)} scatter {share:.2f} times as much as they claim: they are better than that "
@@ -345,7 +380,7 @@ def _covariance_complaints(state: np.void, source: int, scale: float) -> list[st
 
 
 def _velocity_complaints(state: np.void, source: int) -> list[str]:
-    mean, count = (float(value) for value in state["velocity_nis"][source])
+    mean, count = (float(value) for value in state["receiver"]["velocity_nis"][source])
     if count < 2 * MANY_FIXES or mean < HIGH_NIS:
         return []
     return [
@@ -356,14 +391,15 @@ def _velocity_complaints(state: np.void, source: int) -> list[str]:
 
 def _path_complaints(state: np.void, source: int) -> list[str]:
     found = []
-    contradicted, jumps = int(state["contradicted_fixes"][source]), int(state["track_jumps"][source])
+    contradicted, jumps = int(state["receiver"]["contradicted_fixes"][source]), int(state["tracker"]["jumps"][source])
     if contradicted > FEW_FIXES:
         found.append(
             f"{contradicted} fixes{_of(source)} moved otherwise than the velocities of the same receiver, by up to "
-            f"{float(state['contradiction_rate'][source]):.1f} m/s: multipath or spoofing; they were not fused"
+            f"{float(state['receiver']['contradiction_rate'][source]):.1f} m/s: multipath or spoofing; they "
+            "were not fused"
         )
     if jumps:
-        length = float(state["track_jump"][source])
+        length = float(state["tracker"]["jump"][source])
         found.append(
             f"the fixes{_of(source)} jumped {jumps} times, by up to {length:.0f} m, and their velocities did not: "
             "multipath or spoofing"
@@ -372,10 +408,10 @@ def _path_complaints(state: np.void, source: int) -> list[str]:
 
 
 def _departure_complaints(state: np.void, source: int) -> list[str]:
-    departures = int(state["departures"][source])
+    departures = int(state["receiver"]["departures"][source])
     if departures < FEW_DEPARTURES:
         return []
-    stamp = int(state["departure_stamp"][source]) * 1e-9
+    stamp = int(state["receiver"]["departure_stamp"][source]) * 1e-9
     return [
         f"the receiver{_of(source)} and the IMU went different ways {departures} times, first at the stamp "
         f"{stamp:.1f}: multipath, spoofing, or IMU noise parameters that are too small"
@@ -383,7 +419,7 @@ def _departure_complaints(state: np.void, source: int) -> list[str]:
 
 
 def _coast_complaints(state: np.void) -> list[str]:
-    coasts, total = int(state["coasts"]), float(state["coast_nis"])
+    coasts, total = int(state["receiver"]["coasts"]), float(state["receiver"]["coast_nis"])
     if coasts < 2 or 3.0 * total < chdtri(3 * coasts, UNLIKELY):
         return []
     factor = math.sqrt(total / coasts)
@@ -394,11 +430,11 @@ def _coast_complaints(state: np.void) -> list[str]:
 
 
 def _heading_complaints(state: np.void) -> list[str]:
-    if state["heading_stuck"] < 2:
+    if state["receiver"]["heading_stuck"] < 2:
         return []
-    minutes = int(state["heading_stuck"])
+    minutes = int(state["receiver"]["heading_stuck"])
     if state["heading_known"]:
-        std = math.degrees(float(state["heading_mark_std"]))
+        std = math.degrees(float(state["receiver"]["heading_mark_std"]))
         what = f"the heading is known to {std:.1f} deg only and becomes no better"
     else:
         what = "the heading is still unknown"

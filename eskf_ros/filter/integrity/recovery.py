@@ -20,6 +20,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.first_fix import START_VELOCITY_STD
 from eskf_ros.filter.alignment.heading_sensors import reset_given_heading, update_refutation
@@ -30,6 +32,22 @@ from eskf_ros.filter.state.augmented_states import reset_augmented
 from eskf_ros.filter.state.enums import SENSOR_STREAMS, Phase, Stream, Verdict
 from eskf_ros.filter.state.error_state import ERROR_CAPACITY, POSITION, SOURCES, VELOCITY
 from eskf_ros.filter.state.time import NEVER
+
+RECOVERY = np.dtype(
+    [
+        ("absolute_stamp", "i8"),
+        ("absolute_interval", "i8"),
+        ("rejected_fixes", "i8"),
+        ("rejected_since", "i8"),
+        ("resets", "i8"),
+        ("reset_stamp", "i8"),
+        ("recent_resets", "i8"),
+    ],
+    align=True,
+)
+"""When absolute measurements were last accepted, how many were rejected since and from when on; resets of position and
+velocity, the last one, and how often lately.
+"""
 
 MEMBERS = 5
 LEAST_SUPPORT = 1_000_000_000
@@ -69,27 +87,29 @@ def reset_for_new_solution(state, aid, settings):
     if aid.stream != Stream.GNSS_POSITION:
         return
     variance = aid.payload[3] + aid.payload[6]
-    last = state.last_fix_variance[aid.source]
+    last = state.window.last_fix_variance[aid.source]
     if max(variance, last) > SAME_SOLUTION * min(variance, last):
-        state.scatter[aid.source] = 1.0
+        state.tracker.scatter[aid.source] = 1.0
         if settings.position_error_at < state.error_size and settings.correlated_share > 0.0:
             reset_augmented(state, settings.position_error_at, 3, settings)
-    state.last_fix_variance[aid.source] = variance
+    state.window.last_fix_variance[aid.source] = variance
 
 
 @njit
 def phase_of(state, stream, source):
     """Return the phase of an aid at the stamp of the state."""
-    if state.aid_stamp[stream, source] == NEVER:
+    if state.streams.last_stamp[stream, source] == NEVER:
         return Phase.WAITING
     if not is_live(state, stream, source):
         return Phase.OUTAGE
     if not is_fusing(state, stream, source):
         return Phase.REACQUIRING
-    if state.aid_rejected[stream, source] > 0:
+    if state.streams.rejected[stream, source] > 0:
         return Phase.SUSPICIOUS
-    if state.aid_fused_stamp[stream, source] - state.aid_fused_since[stream, source] < FULL_SUPPORT:
-        is_after_reset = stream == Stream.GNSS_POSITION and state.reset_stamp == state.aid_fused_since[stream, source]
+    if state.streams.fused_stamp[stream, source] - state.streams.fused_since[stream, source] < FULL_SUPPORT:
+        is_after_reset = (
+            stream == Stream.GNSS_POSITION and state.recovery.reset_stamp == state.streams.fused_since[stream, source]
+        )
         return Phase.RESET if is_after_reset else Phase.REACQUIRING
     return Phase.FUSING
 
@@ -128,8 +148,8 @@ def recover(state, aid, size, gate, settings, work):
         else:
             restart(state)
     elif stream == Stream.HEADING and aid.verdict == Verdict.FUSED:
-        state.heading_disputed = 0
-    is_lasting = state.stamp - state.aid_fused_stamp[stream, source] > REJECTED_PRESSURE
+        state.heading.disputed = 0
+    is_lasting = state.stamp - state.streams.fused_stamp[stream, source] > REJECTED_PRESSURE
     if stream == Stream.BARO and aid.verdict == Verdict.GATE and is_lasting:
         reset_augmented(state, settings.baro_offset_at, 1, settings)
     note(state, stream, source, aid.verdict)
@@ -158,48 +178,52 @@ def update_weighed_down(state, size, excess, work):
 @njit
 def note(state, stream, source, verdict):
     """Keep the times and counts of an aid."""
-    last = state.aid_stamp[stream, source]
+    last = state.streams.last_stamp[stream, source]
     if last != NEVER:
-        interval = state.aid_interval[stream, source]
+        interval = state.streams.interval[stream, source]
         passed = state.stamp - last
-        state.aid_interval[stream, source] = passed if interval == 0 else min(passed, 2 * interval)
+        state.streams.interval[stream, source] = passed if interval == 0 else min(passed, 2 * interval)
     if verdict in (Verdict.FUSED, Verdict.RESET):
         if verdict == Verdict.RESET or not is_fusing(state, stream, source):
-            state.aid_fused_since[stream, source] = state.stamp
-        state.aid_fused_stamp[stream, source] = state.stamp
-        state.aid_rejected[stream, source] = 0
+            state.streams.fused_since[stream, source] = state.stamp
+        state.streams.fused_stamp[stream, source] = state.stamp
+        state.streams.rejected[stream, source] = 0
         if stream in (Stream.GNSS_POSITION, Stream.PSEUDORANGE):
-            if state.absolute_stamp != NEVER:
-                state.absolute_interval = state.stamp - state.absolute_stamp
-            state.absolute_stamp = state.stamp
-            state.rejected_fixes = 0
+            if state.recovery.absolute_stamp != NEVER:
+                state.recovery.absolute_interval = state.stamp - state.recovery.absolute_stamp
+            state.recovery.absolute_stamp = state.stamp
+            state.recovery.rejected_fixes = 0
             for k in range(SOURCES):
-                state.track_rejected[k] = 0
+                state.tracker.rejected[k] = 0
     else:
-        state.aid_rejected[stream, source] += 1
+        state.streams.rejected[stream, source] += 1
         if stream in (Stream.GNSS_POSITION, Stream.PSEUDORANGE):
-            if state.rejected_fixes == 0:
-                state.rejected_since = state.stamp
-            state.rejected_fixes += 1
+            if state.recovery.rejected_fixes == 0:
+                state.recovery.rejected_since = state.stamp
+            state.recovery.rejected_fixes += 1
         if stream == Stream.GNSS_POSITION:
             if verdict == Verdict.CONTRADICTED:
-                state.track_rejected[source] = 0
-            elif state.track_misses[source] == 0:
-                if state.track_rejected[source] == 0:
-                    state.track_rejected_since[source] = state.stamp
-                state.track_rejected[source] += 1
-    state.aid_stamp[stream, source] = state.stamp
+                state.tracker.rejected[source] = 0
+            elif state.tracker.misses[source] == 0:
+                if state.tracker.rejected[source] == 0:
+                    state.tracker.rejected_since[source] = state.stamp
+                state.tracker.rejected[source] += 1
+    state.streams.last_stamp[stream, source] = state.stamp
 
 
 @njit
 def has_won(state, source):
     """Say whether the rejected fixes of a receiver have agreed with each other for long enough."""
-    if state.track_misses[source] > 0 or state.track_rejected[source] + 1 < MEMBERS or is_contradicted(state, source):
+    if (
+        state.tracker.misses[source] > 0
+        or state.tracker.rejected[source] + 1 < MEMBERS
+        or is_contradicted(state, source)
+    ):
         return False
-    since, last = state.track_rejected_since[source], state.absolute_stamp
+    since, last = state.tracker.rejected_since[source], state.recovery.absolute_stamp
     needed = LEAST_SUPPORT
     if last != NEVER and since - last <= patience(state, Stream.GNSS_POSITION.value, source):
-        support = last - state.aid_fused_since[Stream.GNSS_POSITION.value, source]
+        support = last - state.streams.fused_since[Stream.GNSS_POSITION.value, source]
         needed = min(max(support, LEAST_SUPPORT), FULL_SUPPORT)
         if needed == FULL_SUPPORT and is_against_inertial(state, source):
             needed = AGAINST_INERTIAL
@@ -212,8 +236,8 @@ def is_against_inertial(state, source):
     if is_live(state, Stream.GNSS_VELOCITY.value, source):
         return not is_fusing(state, Stream.GNSS_VELOCITY.value, source)
     for i in range(3):
-        known = state.track_rate_variance[source, i] + state.covariance[VELOCITY + i, VELOCITY + i]
-        if state.track_rate[source, i] ** 2 > INERTIAL_SIGMAS**2 * known:
+        known = state.tracker.rate_variance[source, i] + state.covariance[VELOCITY + i, VELOCITY + i]
+        if state.tracker.rate[source, i] ** 2 > INERTIAL_SIGMAS**2 * known:
             return True
     return False
 
@@ -231,7 +255,7 @@ def reset(state, source, settings, work):
     whole = 1.0 / (1.0 - settings.correlated_share) if settings.position_error_at < state.error_size else 1.0
     for i in range(3):
         state.position_map[i] += offset_of_track(state, source, i)
-        covariance[POSITION + i, POSITION + i] = max(state.track_offset_variance[source, i], whole * work.noise[i, i])
+        covariance[POSITION + i, POSITION + i] = max(state.tracker.offset_variance[source, i], whole * work.noise[i, i])
     if not is_fusing(state, Stream.GNSS_VELOCITY.value, source):
         forget_error(covariance, VELOCITY)
         is_led = is_live(state, Stream.GNSS_VELOCITY.value, source)
@@ -239,16 +263,16 @@ def reset(state, source, settings, work):
             p, v = POSITION + i, VELOCITY + i
             covariance[v, v] = START_VELOCITY_STD**2
             if not is_led:
-                state.velocity_map[i] += state.track_rate[source, i]
-                covariance[v, v] = state.track_rate_variance[source, i]
-                covariance[p, v] = state.track_mixed_variance[source, i]
-                covariance[v, p] = state.track_mixed_variance[source, i]
+                state.velocity_map[i] += state.tracker.rate[source, i]
+                covariance[v, v] = state.tracker.rate_variance[source, i]
+                covariance[p, v] = state.tracker.mixed_variance[source, i]
+                covariance[v, p] = state.tracker.mixed_variance[source, i]
     if settings.position_error_at < state.error_size:
         reset_augmented(state, settings.position_error_at, 3, settings)
-    is_recent = state.reset_stamp != NEVER and state.stamp - state.reset_stamp < RESET_HELPS
-    state.recent_resets = state.recent_resets + 1 if is_recent else 1
-    state.reset_stamp = state.stamp
-    state.resets += 1
+    is_recent = state.recovery.reset_stamp != NEVER and state.stamp - state.recovery.reset_stamp < RESET_HELPS
+    state.recovery.recent_resets = state.recovery.recent_resets + 1 if is_recent else 1
+    state.recovery.reset_stamp = state.stamp
+    state.recovery.resets += 1
 
 
 @njit
@@ -264,9 +288,9 @@ def forget_error(covariance, place):
 def is_lost(state):
     """Say whether only a new alignment is left: resets do not help, or neither fixes nor velocities are accepted."""
     is_new = state.restarts > 0 and state.stamp - state.first_stamp < RESTART_HELPS
-    if state.recent_resets >= RESETS:
+    if state.recovery.recent_resets >= RESETS:
         return not is_new
-    since = state.rejected_since
+    since = state.recovery.rejected_since
     for source in range(SOURCES):
-        since = max(since, state.aid_fused_stamp[Stream.GNSS_VELOCITY.value, source])
-    return state.rejected_fixes >= MEMBERS and state.stamp - since >= LAST_RESORT
+        since = max(since, state.streams.fused_stamp[Stream.GNSS_VELOCITY.value, source])
+    return state.recovery.rejected_fixes >= MEMBERS and state.stamp - since >= LAST_RESORT

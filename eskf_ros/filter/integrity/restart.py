@@ -14,23 +14,23 @@ def restart(state):
     state.restarts += 1
     forget_search(state)
     forget_tracks(state)
-    state.hint_count = 0
-    state.given_stamp = NEVER
-    state.rejected_fixes = 0
-    state.recent_resets = 0
+    state.heading.candidate_count = 0
+    state.heading.given_stamp = NEVER
+    state.recovery.rejected_fixes = 0
+    state.recovery.recent_resets = 0
     state.level_known = 0
     state.position_known = 0
     state.heading_known = 0
     state.first_stamp = NEVER
-    state.window_start = NEVER
-    state.still_stamp = NEVER
-    state.still_count = 0
+    state.window.start = NEVER
+    state.window.still_stamp = NEVER
+    state.window.still_samples = 0
     # What was learnt of the receivers was learnt with an attitude that is not believed any more.
-    state.fault_stamp = NEVER
-    state.fault_information[:] = 0.0
-    state.fault_evidence[:] = 0.0
+    state.receiver.fault_stamp = NEVER
+    state.receiver.fault_information[:] = 0.0
+    state.receiver.fault_evidence[:] = 0.0
     for i in range(2):
-        state.clock_known[i] = 0
+        state.tight.clock_known[i] = 0
     for i in range(3):
         state.position_map[i] = 0.0
         state.velocity_map[i] = 0.0

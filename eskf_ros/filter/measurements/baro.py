@@ -35,8 +35,8 @@ def place_of_sensor(state, settings):
     """Return latitude, longitude (rad) and height (m) of the barometer, and its place from the IMU in map axes."""
     p, arm = state.position_map, settings.baro_arm_body
     lever = rotate(to_matrix(state.attitude), (arm[0], arm[1], arm[2]))
-    offset = rotate(state.map_to_ecef, (p[0] + lever[0], p[1] + lever[1], p[2] + lever[2]))
-    origin = state.origin_ecef
+    offset = rotate(state.frame.map_to_ecef, (p[0] + lever[0], p[1] + lever[1], p[2] + lever[2]))
+    origin = state.frame.origin_ecef
     return ecef_to_geodetic(origin[0] + offset[0], origin[1] + offset[1], origin[2] + offset[2]), lever
 
 
@@ -46,7 +46,7 @@ def predict(state, source, settings):
     (_, _, height), _ = place_of_sensor(state, settings)
     offset = state.optional[settings.baro_offset_at - ERROR_SIZE]
     scale = state.optional[settings.baro_scale_at - ERROR_SIZE]
-    return height + offset + scale * (height - state.datum[2])
+    return height + offset + scale * (height - state.frame.datum[2])
 
 
 @njit
@@ -60,7 +60,7 @@ def linearize(state, payload, source, settings, work):
     work.noise[0, 0] = slope**2 * payload[3]
 
     axes = east_north_up_to_ecef(latitude, longitude)
-    up = rotate_back(state.map_to_ecef, (axes[0][2], axes[1][2], axes[2][2]))
+    up = rotate_back(state.frame.map_to_ecef, (axes[0][2], axes[1][2], axes[2][2]))
     growth = 1.0 + state.optional[settings.baro_scale_at - ERROR_SIZE]
     # up . (theta x lever) = theta . (lever x up)
     tilt = cross(lever, up)
@@ -69,5 +69,5 @@ def linearize(state, payload, source, settings, work):
         if state.heading_known == 1:
             work.jacobian[0, ATTITUDE + i] = growth * tilt[i]
     work.jacobian[0, settings.baro_offset_at] = 1.0
-    work.jacobian[0, settings.baro_scale_at] = height - state.datum[2]
+    work.jacobian[0, settings.baro_scale_at] = height - state.frame.datum[2]
     return 1

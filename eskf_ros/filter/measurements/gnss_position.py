@@ -27,8 +27,12 @@ NOTABLE_SCATTER = 2.0
 def position_of_fix(state, payload):
     """Return the map position (m) of a fix."""
     fix = geodetic_to_ecef(payload[0], payload[1], payload[2])
-    offset = (fix[0] - state.origin_ecef[0], fix[1] - state.origin_ecef[1], fix[2] - state.origin_ecef[2])
-    return rotate_back(state.map_to_ecef, offset)
+    offset = (
+        fix[0] - state.frame.origin_ecef[0],
+        fix[1] - state.frame.origin_ecef[1],
+        fix[2] - state.frame.origin_ecef[2],
+    )
+    return rotate_back(state.frame.map_to_ecef, offset)
 
 
 @njit
@@ -41,7 +45,7 @@ def predict(state, source, settings):
 @njit
 def noise_factor(state, source):
     """Return the factor on the covariances of a receiver's fixes that their scatter asks for (see ``recovery``)."""
-    return state.scatter[source] if state.scatter[source] > NOTABLE_SCATTER else 1.0
+    return state.tracker.scatter[source] if state.tracker.scatter[source] > NOTABLE_SCATTER else 1.0
 
 
 @njit

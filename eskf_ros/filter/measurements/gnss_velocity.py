@@ -29,7 +29,7 @@ def linearize(state, payload, source, settings, work):
     """Write innovation, Jacobian and noise of one velocity to ``work``; return the number of scalars."""
     clear(work)
     local_to_ecef = local_east_north_up_to_ecef(state)
-    measured = rotate_back(state.map_to_ecef, rotate(local_to_ecef, (payload[0], payload[1], payload[2])))
+    measured = rotate_back(state.frame.map_to_ecef, rotate(local_to_ecef, (payload[0], payload[1], payload[2])))
     predicted = predict(state, source, settings)
     for i in range(3):
         work.innovation[i] = measured[i] - predicted[i]
@@ -41,7 +41,7 @@ def linearize(state, payload, source, settings, work):
     lever = rotate(rotation, arm)
     sway = rotate(rotation, cross(body_rate(state, rotation), arm))
     # The gyro reading of this instant carries the white noise of one sample.
-    rate_variance = settings.gyro_noise_density**2 / state.imu_interval
+    rate_variance = settings.gyro_noise_density**2 / state.imu.interval
     for i in range(3):
         for j in range(3):
             work.noise[i, j] -= rate_variance * lever[i] * lever[j]
@@ -52,7 +52,7 @@ def linearize(state, payload, source, settings, work):
         return SIZE
     set_minus_cross(work.jacobian, ATTITUDE, sway)
     # An attitude error also turns the Earth rate into the body: [lever]x [Earth rate]x theta.
-    earth = state.earth_rate_map
+    earth = state.frame.earth_rate_map
     along = dot(lever, earth)
     for i in range(3):
         for j in range(3):

@@ -41,9 +41,9 @@ def linearize(state, payload, source, settings, work):
     clear(work)
     yaw = payload[0]
     if source == IMU_ORIENTATION and settings.is_orientation_magnetic == 1:
-        if state.field_known == 0:
+        if state.mag.field_known == 0:
             return 0
-        yaw -= state.field_declination
+        yaw -= state.mag.declination
     line = settings.heading_lines_body[source]
     local_to_ecef = local_east_north_up_to_ecef(state)
     d = to_local(state, local_to_ecef, (line[0], line[1], line[2]))

@@ -44,7 +44,7 @@ def set_east_north_up_covariance(noise, state, local_to_ecef, payload, first):
     """Write a covariance given in local East-North-Up (six values from ``payload[first]``) in map axes."""
     ee, en, eu = payload[first], payload[first + 1], payload[first + 2]
     nn, nu, uu = payload[first + 3], payload[first + 4], payload[first + 5]
-    ecef = state.map_to_ecef
+    ecef = state.frame.map_to_ecef
     for j in range(3):
         local = rotate_back(local_to_ecef, (ecef[0, j], ecef[1, j], ecef[2, j]))
         spread = (
@@ -78,7 +78,7 @@ def set_point_velocity_row(jacobian, row, axis, scale, state, rotation, arm):
     axis_map = rotate(rotation, axis)
     lever = cross(axis, arm)
     turned = cross(axis_map, state.velocity_map)
-    earth = cross(rotate(rotation, lever), state.earth_rate_map)
+    earth = cross(rotate(rotation, lever), state.frame.earth_rate_map)
     for j in range(3):
         jacobian[row, VELOCITY + j] = scale * axis_map[j]
         jacobian[row, ATTITUDE + j] = scale * (turned[j] + earth[j])
@@ -118,7 +118,7 @@ def set_mounting(jacobian, row, yaw_part, pitch_part, state, settings):
 @njit
 def gyro_noise_variance(state, settings):
     """Return the variance (rad2/s2 per axis) of the white noise of a single gyro reading."""
-    return settings.gyro_noise_density**2 / state.imu_interval
+    return settings.gyro_noise_density**2 / state.imu.interval
 
 
 @njit
@@ -136,13 +136,13 @@ def horizontal_acceleration(state, rotation, force):
 def to_local(state, local_to_ecef, direction_body):
     """Return a direction of the body in the axes whose rotation to ECEF is given (East-North-Up at its place)."""
     direction_map = rotate(to_matrix(state.attitude), direction_body)
-    return rotate_back(local_to_ecef, rotate(state.map_to_ecef, direction_map))
+    return rotate_back(local_to_ecef, rotate(state.frame.map_to_ecef, direction_map))
 
 
 @njit
 def set_attitude_row(jacobian, row, state, local_to_ecef, local):
     """Write how a small rotation about the local axes (``local``) changes a scalar, in map axes."""
-    in_map = rotate_back(state.map_to_ecef, rotate(local_to_ecef, local))
+    in_map = rotate_back(state.frame.map_to_ecef, rotate(local_to_ecef, local))
     for i in range(3):
         jacobian[row, ATTITUDE + i] = in_map[i]
 

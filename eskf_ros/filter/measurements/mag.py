@@ -16,12 +16,31 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import local_east_north_up_to_ecef
 from eskf_ros.filter.measurements.jacobians import clear, set_attitude_row, to_local
 from eskf_ros.filter.state.enums import Verdict
 from eskf_ros.filter.state.error_state import ERROR_SIZE
 from eskf_ros.geodesy.rotation import dot, rotate, rotate_back, to_matrix, wrapped
+
+EARTH_FIELD = np.dtype(
+    [
+        ("declination", "f8"),
+        ("inclination", "f8"),
+        ("strength", "f8"),
+        ("field_known", "i8"),
+        ("disturbed_stamp", "i8"),
+        ("heading", "f8"),
+        ("position", "f8", (3,)),
+    ],
+    align=True,
+)
+"""The Earth's magnetic field where the last good fix was (rad, rad, T; strength 0: unknown), whether it is known, when
+it
+was last found disturbed; heading (rad) and position (m) since which its error is another.
+"""
 
 WEAKEST_LEVEL = 2.0e-6
 """Near the magnetic poles the level part of the field (T) tells no heading."""
@@ -68,21 +87,21 @@ def linearize(state, payload, settings, work):
     level_square = b[0] ** 2 + b[1] ** 2
     if level_square < WEAKEST_LEVEL**2:
         return 0
-    expected = 0.5 * math.pi - state.field_declination
+    expected = 0.5 * math.pi - state.mag.declination
     work.innovation[0] = wrapped(expected - predict(state, payload, settings))
     # Not at the measured direction: its noise, which is in the innovation too, would drag along tilt and hard iron.
     angle = expected + state.optional[settings.mag_error_at - ERROR_SIZE]
     level = math.sqrt(level_square)
     east, north, slope = math.cos(angle), math.sin(angle), -b[2] / level
-    if state.field_strength > 0.0:
-        level = state.field_strength * math.cos(state.field_inclination)
-        slope = math.tan(state.field_inclination)
+    if state.mag.strength > 0.0:
+        level = state.mag.strength * math.cos(state.mag.inclination)
+        slope = math.tan(state.mag.inclination)
     set_attitude_row(work.jacobian, 0, state, local_to_ecef, (slope * east, slope * north, 1.0))
     work.jacobian[0, settings.mag_error_at] = -1.0
 
     # How the angle changes with the reading: first in local axes, then in map, body, and the axes of the sensor.
     change = (-north / level, east / level, 0.0)
-    change = rotate_back(state.map_to_ecef, rotate(local_to_ecef, change))
+    change = rotate_back(state.frame.map_to_ecef, rotate(local_to_ecef, change))
     change = rotate_back(settings.mag_to_imu, rotate_back(to_matrix(state.attitude), change))
     xx, xy, xz, yy, yz, zz = payload[3], payload[4], payload[5], payload[6], payload[7], payload[8]
     spread = rotate(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)), change)
@@ -99,25 +118,25 @@ def update_disturbance(state, aid, settings):
 
     What they are is kept for the monitor.
     """
-    if state.field_strength <= 0.0:
+    if state.mag.strength <= 0.0:
         return False
     b = to_local(state, local_east_north_up_to_ecef(state), earth_field_body(state, aid.payload, settings))
     strength = math.sqrt(dot(b, b))
     inclination = math.atan2(-b[2], math.hypot(b[0], b[1]))
-    state.field_found[0] = strength
-    state.field_found[1] = inclination
+    state.heading_monitor.field_found[0] = strength
+    state.heading_monitor.field_found[1] = inclination
     doubt = 0.0
     place = settings.magnetic_bias_at
     if place < state.error_size:
         for i in range(3):
             doubt = max(doubt, state.covariance[place + i, place + i])
-    doubt = SIGMAS * math.sqrt(doubt) / state.field_strength
+    doubt = SIGMAS * math.sqrt(doubt) / state.mag.strength
     if (
-        abs(strength / state.field_strength - 1.0) > settings.mag_strength_tolerance + doubt
-        or abs(inclination - state.field_inclination) > settings.mag_inclination_tolerance + doubt
+        abs(strength / state.mag.strength - 1.0) > settings.mag_strength_tolerance + doubt
+        or abs(inclination - state.mag.inclination) > settings.mag_inclination_tolerance + doubt
     ):
-        state.disturbed_stamp = aid.stamp
-    return aid.stamp - state.disturbed_stamp < HOLD
+        state.mag.disturbed_stamp = aid.stamp
+    return aid.stamp - state.mag.disturbed_stamp < HOLD
 
 
 @njit
@@ -129,9 +148,9 @@ def propagate_mag_error(state, heading, settings):
     estimate trembles, makes no way.
     """
     i = settings.mag_error_at
-    p, last = state.position_map, state.mag_position
+    p, last = state.position_map, state.mag.position
     distance = math.sqrt((p[0] - last[0]) ** 2 + (p[1] - last[1]) ** 2 + (p[2] - last[2]) ** 2)
-    way = distance / settings.mag_error_distance + abs(wrapped(heading - state.mag_heading)) / TURN
+    way = distance / settings.mag_error_distance + abs(wrapped(heading - state.mag.heading)) / TURN
     if way < STEP:
         return
     fading = math.exp(-way)
@@ -141,16 +160,16 @@ def propagate_mag_error(state, heading, settings):
         covariance[i, j] *= fading
         covariance[j, i] *= fading
     covariance[i, i] += (1.0 - fading**2) * settings.optional_std[i - ERROR_SIZE] ** 2
-    state.mag_heading = heading
+    state.mag.heading = heading
     for k in range(3):
-        state.mag_position[k] = p[k]
+        state.mag.position[k] = p[k]
 
 
 @njit
 def note_field(state, aid, place):
     """Remember the Earth's field at a good fix or range, which carries it from ``place`` of its payload on."""
     if aid.verdict == Verdict.FUSED and aid.payload[place] > 0.0:
-        state.field_declination = aid.payload[place + 1]
-        state.field_inclination = aid.payload[place + 2]
-        state.field_strength = aid.payload[place + 3]
-        state.field_known = 1
+        state.mag.declination = aid.payload[place + 1]
+        state.mag.inclination = aid.payload[place + 2]
+        state.mag.strength = aid.payload[place + 3]
+        state.mag.field_known = 1

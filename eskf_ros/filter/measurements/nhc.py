@@ -82,7 +82,7 @@ def linearize(state, settings, work):
     slip = settings.nhc_slip * horizontal_acceleration(state, rotation, mean_force(state))
     angle_variance = settings.nhc_angle_std**2 + slip**2
     loosening = 1.0
-    if state.slip_stamp != NEVER and state.stamp - state.slip_stamp <= SLIP_MEMORY:
+    if state.rest.slip_stamp != NEVER and state.stamp - state.rest.slip_stamp <= SLIP_MEMORY:
         loosening = SLIPPING**2
     rate_variance = gyro_noise_variance(state, settings)
     left_lever, up_lever = cross(left, arm), cross(up, arm)

@@ -71,9 +71,9 @@ def predict(state, settings):
 @njit
 def repeated(state, time):
     """Return the factor on the variance of an error that lasts for ``time`` s and comes with every message."""
-    if state.wheel_stamp == NEVER:
+    if state.rest.wheel_stamp == NEVER:
         return 1.0
-    interval = max((state.stamp - state.wheel_stamp) * 1e-9, SHORTEST_INTERVAL)
+    interval = max((state.stamp - state.rest.wheel_stamp) * 1e-9, SHORTEST_INTERVAL)
     return max(1.0, 2.0 * time / interval)
 
 
@@ -107,7 +107,7 @@ def linearize(state, payload, settings, work):
         size = 1
     if payload[6] >= 0.0:
         work.innovation[size] = payload[1] - turn_rate
-        earth = cross(rotate(rotation, up), state.earth_rate_map)
+        earth = cross(rotate(rotation, up), state.frame.earth_rate_map)
         for j in range(3):
             work.jacobian[size, ATTITUDE + j] = -earth[j]
             work.jacobian[size, GYRO_BIAS + j] = -up[j]

@@ -28,7 +28,7 @@ INTERVAL = CONSTRAINT_INTERVAL * 1e-9
 @njit
 def predict(state):
     """Return what the gyro reads (rad/s, IMU axes) when the robot stands still."""
-    earth = rotate_back(to_matrix(state.attitude), state.earth_rate_map)
+    earth = rotate_back(to_matrix(state.attitude), state.frame.earth_rate_map)
     bias = state.gyro_bias
     return (bias[0] + earth[0], bias[1] + earth[1], bias[2] + earth[2])
 
@@ -62,7 +62,7 @@ def linearize(state, settings, work):
         work.innovation[i] = measured[i] - predicted[i]
         work.noise[i, i] = density**2 / INTERVAL + settings.zupt_rate_std**2
         axis = (rotation[0][i], rotation[1][i], rotation[2][i])
-        earth = cross(axis, state.earth_rate_map)
+        earth = cross(axis, state.frame.earth_rate_map)
         for j in range(3):
             work.jacobian[i, ATTITUDE + j] = earth[j]
             # The attitude has turned by R times the noise, and lags by it: the covariance of noise i and error j.

@@ -53,7 +53,7 @@ CONTRADICTIONS = 3
 @njit
 def status_of(state, settings):
     """Return the rung of the ladder; coasting is a second without a fix, or twice the usual wait up to three."""
-    if state.imu_stamp == NEVER:
+    if state.imu.stamp == NEVER:
         return Status.WAITING_IMU
     if state.level_known == 0:
         return Status.LEVELLING
@@ -63,10 +63,10 @@ def status_of(state, settings):
         return Status.WAITING_FIX
     if state.heading_known == 0:
         return Status.WAITING_HEADING
-    patience = max(SHORTEST_COAST, min(LONGEST_WAIT, 2 * state.absolute_interval))
-    if state.stamp - state.absolute_stamp > patience:
+    patience = max(SHORTEST_COAST, min(LONGEST_WAIT, 2 * state.recovery.absolute_interval))
+    if state.stamp - state.recovery.absolute_stamp > patience:
         return Status.COASTING
-    if state.rejected_fixes >= CONTRADICTIONS:
+    if state.recovery.rejected_fixes >= CONTRADICTIONS:
         return Status.DEGRADED
     if state.covariance[ATTITUDE + 2, ATTITUDE + 2] > settings.good_heading_std**2:
         return Status.ALIGNING
@@ -196,7 +196,7 @@ def write_twist_covariance(state, base_to_map, settings, row):
     # The sway of the mounting offset is known in body axes: an attitude error turns only the velocity of the IMU.
     velocity = (state.velocity_map[0], state.velocity_map[1], state.velocity_map[2])
     # What the rate error times the mounting offset adds to the velocity is left out: millimetres per second.
-    rate_variance = settings.gyro_noise_density**2 / state.imu_interval
+    rate_variance = settings.gyro_noise_density**2 / state.imu.interval
     for i in range(3):
         forward_i = (base_to_map[0][i], base_to_map[1][i], base_to_map[2][i])
         lever_i = cross(forward_i, velocity)

@@ -20,6 +20,21 @@ from eskf_ros.filter.state.error_state import GYRO_BIAS, VELOCITY
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.geodesy.rotation import wrapped
 
+STEP = np.dtype(
+    [
+        ("step_position", "f8", (3,)),
+        ("step_heading", "f8"),
+        ("sample_position", "f8", (3,)),
+        ("sample_heading", "f8"),
+        ("jump_position", "f8", (3,)),
+        ("jump_heading", "f8"),
+    ],
+    align=True,
+)
+"""Step over the last IMU interval (m in map, rad), pose at its end, and corrections since: for the odometry without
+jumps.
+"""
+
 LOCAL = np.dtype(
     [
         ("started", "i8"),
@@ -41,21 +56,23 @@ def measure_step(state, settings):
     """Note displacement (m, map) and turn (rad) since the last IMU sample, corrections left out."""
     heading = heading_of(state, settings)
     for i in range(3):
-        state.step_position[i] = state.position_map[i] - state.sample_position[i] - state.jump_position[i]
-        state.sample_position[i] = state.position_map[i]
-        state.jump_position[i] = 0.0
-    state.step_heading = wrapped(heading - state.sample_heading - state.jump_heading)
-    state.sample_heading = heading
-    state.jump_heading = 0.0
+        state.odom.step_position[i] = (
+            state.position_map[i] - state.odom.sample_position[i] - state.odom.jump_position[i]
+        )
+        state.odom.sample_position[i] = state.position_map[i]
+        state.odom.jump_position[i] = 0.0
+    state.odom.step_heading = wrapped(heading - state.odom.sample_heading - state.odom.jump_heading)
+    state.odom.sample_heading = heading
+    state.odom.jump_heading = 0.0
 
 
 @njit
 def note_jump(state, position, heading, settings):
     """Add how far a correction has moved the state from ``position`` (m) and ``heading`` (rad)."""
     for i in range(3):
-        state.jump_position[i] += state.position_map[i] - position[i]
-        state.corrections_map[i] += state.position_map[i] - position[i]
-    state.jump_heading += wrapped(heading_of(state, settings) - heading)
+        state.odom.jump_position[i] += state.position_map[i] - position[i]
+        state.tracker.corrections_map[i] += state.position_map[i] - position[i]
+    state.odom.jump_heading += wrapped(heading_of(state, settings) - heading)
 
 
 @njit
@@ -67,15 +84,15 @@ def carry(local, state, settings):
     if local.started == 0:
         local.started = 1
         return
-    local.heading += state.step_heading
-    c = math.cos(local.heading - state.sample_heading)
-    s = math.sin(local.heading - state.sample_heading)
-    x, y, z = state.step_position[0], state.step_position[1], state.step_position[2]
+    local.heading += state.odom.step_heading
+    c = math.cos(local.heading - state.odom.sample_heading)
+    s = math.sin(local.heading - state.odom.sample_heading)
+    x, y, z = state.odom.step_position[0], state.odom.step_position[1], state.odom.step_position[2]
     local.position[0] += c * x - s * y
     local.position[1] += s * x + c * y
     local.position[2] += z
 
-    dt = state.imu_interval
+    dt = state.imu.interval
     covariance = state.covariance
     bias_variance = 0.0
     velocity_variance = 0.0
@@ -83,7 +100,10 @@ def carry(local, state, settings):
         bias_variance = max(bias_variance, covariance[GYRO_BIAS + i, GYRO_BIAS + i])
         velocity_variance = max(velocity_variance, covariance[VELOCITY + i, VELOCITY + i])
     if state.position_known == 0:
-        at_rest = state.still_stamp != NEVER and state.stamp - state.still_stamp < 1.5e9 * settings.static_duration
+        at_rest = (
+            state.window.still_stamp != NEVER
+            and state.stamp - state.window.still_stamp < 1.5e9 * settings.static_duration
+        )
         velocity_variance = STILL_SPEED**2 if at_rest else UNKNOWN_SPEED**2
     heading_std = math.sqrt(local.heading_variance) + math.sqrt(bias_variance) * dt
     local.heading_variance = heading_std**2 + settings.gyro_noise_density**2 * dt

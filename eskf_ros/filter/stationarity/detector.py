@@ -17,6 +17,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from eskf_ros.compiled import njit
 from eskf_ros.filter.state.enums import CONSTRAINT_INTERVAL, Stream, Verdict
 from eskf_ros.filter.state.error_state import SOURCES, VELOCITY
@@ -24,6 +26,38 @@ from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity.static_window import update_motion
 from eskf_ros.geodesy.earth import geodetic_to_ecef
 from eskf_ros.geodesy.rotation import dot
+
+REST = np.dtype(
+    [
+        ("block_end", "i8"),
+        ("block_broken", "i8"),
+        ("block_count", "i8"),
+        ("block_sum", "f8", (6,)),
+        ("block_square_sum", "f8", (6,)),
+        ("block_half_count", "i8"),
+        ("block_half_sum", "f8", (6,)),
+        ("moving_stamp", "i8"),
+        ("resting_stamp", "i8"),
+        ("moving_activity", "f8"),
+        ("resting_activity", "f8"),
+        ("quiet", "i8"),
+        ("quiet_fix_stamp", "i8", (SOURCES,)),
+        ("quiet_fix_variance", "f8", (SOURCES,)),
+        ("quiet_fix_ecef", "f8", (SOURCES, 3)),
+        ("quiet_pressure_stamp", "i8"),
+        ("quiet_pressure", "f8"),
+        ("wheel_stamp", "i8"),
+        ("slip_stamp", "i8"),
+    ],
+    align=True,
+)
+"""IMU samples since the last grid point of the constraints, and evidence of rest and motion.
+
+``block_*``: the grid point after them, whether a sample is missing, how many, sums, and those of the first half.
+``moving_stamp``, ``resting_stamp``: when another sensor last saw it; ``moving_activity``, ``resting_activity``: how
+quiet the IMU is then; ``quiet``: whether it was until the last grid point, with fix and pressure when it became so.
+``wheel_stamp``, ``slip_stamp``: when the wheels spoke last, and when the gate last refused them.
+"""
 
 FEWEST_SAMPLES = 3
 """Of fewer samples in half an interval the spread says nothing."""
@@ -78,54 +112,54 @@ UNSEEN_SPEED_STD = 0.2
 def add_to_block(state, settings):
     """Add the newest IMU sample to the sums since the last grid point."""
     end = -(-state.stamp // CONSTRAINT_INTERVAL) * CONSTRAINT_INTERVAL
-    if state.block_end != end:
+    if state.rest.block_end != end:
         learn_from_block(state, settings)
-        state.block_end = end
-        state.block_broken = 0
-        state.block_count = 0
-        state.block_half_count = 0
+        state.rest.block_end = end
+        state.rest.block_broken = 0
+        state.rest.block_count = 0
+        state.rest.block_half_count = 0
         for i in range(6):
-            state.block_sum[i] = 0.0
-            state.block_square_sum[i] = 0.0
-    if state.imu_interval > settings.imu_gap:
-        state.block_broken = 1
-    if state.block_half_count == 0 and 2 * (end - state.stamp) < CONSTRAINT_INTERVAL:
-        state.block_half_count = state.block_count
+            state.rest.block_sum[i] = 0.0
+            state.rest.block_square_sum[i] = 0.0
+    if state.imu.interval > settings.imu_gap:
+        state.rest.block_broken = 1
+    if state.rest.block_half_count == 0 and 2 * (end - state.stamp) < CONSTRAINT_INTERVAL:
+        state.rest.block_half_count = state.rest.block_count
         for i in range(6):
-            state.block_half_sum[i] = state.block_sum[i]
-    state.block_count += 1
+            state.rest.block_half_sum[i] = state.rest.block_sum[i]
+    state.rest.block_count += 1
     for i in range(3):
         force, rate = state.specific_force[i], state.angular_rate[i]
-        state.block_sum[i] += force
-        state.block_square_sum[i] += force * force
-        state.block_sum[3 + i] += rate
-        state.block_square_sum[3 + i] += rate * rate
+        state.rest.block_sum[i] += force
+        state.rest.block_square_sum[i] += force * force
+        state.rest.block_sum[3 + i] += rate
+        state.rest.block_square_sum[3 + i] += rate * rate
 
 
 @njit
 def is_complete(state):
     """Say whether there are enough readings and no gap among them."""
-    count = state.block_half_count
-    return state.block_broken == 0 and count >= FEWEST_SAMPLES and state.block_count - count >= FEWEST_SAMPLES
+    count = state.rest.block_half_count
+    return state.rest.block_broken == 0 and count >= FEWEST_SAMPLES and state.rest.block_count - count >= FEWEST_SAMPLES
 
 
 @njit
 def has_block(state):
     """Say whether the state stands at a grid point and has the readings before it."""
-    return state.block_end == state.stamp and is_complete(state)
+    return state.rest.block_end == state.stamp and is_complete(state)
 
 
 @njit
 def mean_force(state):
     """Return the mean specific force (m/s2, IMU axes, raw) since the last grid point."""
-    n, total = state.block_count, state.block_sum
+    n, total = state.rest.block_count, state.rest.block_sum
     return (total[0] / n, total[1] / n, total[2] / n)
 
 
 @njit
 def mean_rate(state):
     """Return the mean angular rate (rad/s, IMU axes, raw) since the last grid point."""
-    n, total = state.block_count, state.block_sum
+    n, total = state.rest.block_count, state.rest.block_sum
     return (total[3] / n, total[4] / n, total[5] / n)
 
 
@@ -134,8 +168,8 @@ def unrest(state, settings):
     """Return the sum of the variances of the readings over the largest that may still be rest; -1 if one exceeds it."""
     total = 0.0
     for i in range(6):
-        mean = state.block_sum[i] / state.block_count
-        variance = max(state.block_square_sum[i] / state.block_count - mean * mean, 0.0)
+        mean = state.rest.block_sum[i] / state.rest.block_count
+        variance = max(state.rest.block_square_sum[i] / state.rest.block_count - mean * mean, 0.0)
         limit = settings.still_accel_std if i < 3 else settings.still_gyro_std
         if variance > limit * limit:
             return -1.0
@@ -152,9 +186,11 @@ def is_steady(state, settings):
     """
     half = 0.5e-9 * CONSTRAINT_INTERVAL
     sway = 6.0 * (settings.zupt_velocity_std / half) ** 2
-    first, second = state.block_half_count, state.block_count - state.block_half_count
+    first, second = state.rest.block_half_count, state.rest.block_count - state.rest.block_half_count
     for i in range(6):
-        change = (state.block_sum[i] - state.block_half_sum[i]) / second - state.block_half_sum[i] / first
+        change = (state.rest.block_sum[i] - state.rest.block_half_sum[i]) / second - state.rest.block_half_sum[
+            i
+        ] / first
         if i < 3:
             variance = 2.0 * settings.accel_noise_density**2 / half + sway
         else:
@@ -168,24 +204,26 @@ def is_steady(state, settings):
 def learn_from_block(state, settings):
     """At the end of a block: how quiet are rest and motion that were seen? Where did the robot become quiet?"""
     level = unrest(state, settings) if is_complete(state) and is_steady(state, settings) else -1.0
-    moved = state.moving_stamp > state.block_end - CONSTRAINT_INTERVAL
-    rested = state.resting_stamp > state.block_end - CONSTRAINT_INTERVAL
-    was_quiet = state.quiet
-    state.quiet = 1 if level >= 0.0 and not moved else 0
-    if state.quiet != was_quiet:
+    moved = state.rest.moving_stamp > state.rest.block_end - CONSTRAINT_INTERVAL
+    rested = state.rest.resting_stamp > state.rest.block_end - CONSTRAINT_INTERVAL
+    was_quiet = state.rest.quiet
+    state.rest.quiet = 1 if level >= 0.0 and not moved else 0
+    if state.rest.quiet != was_quiet:
         for source in range(SOURCES):
-            state.quiet_fix_stamp[source] = NEVER
-        state.quiet_pressure_stamp = NEVER
+            state.rest.quiet_fix_stamp[source] = NEVER
+        state.rest.quiet_pressure_stamp = NEVER
     if level < 0.0:
         return
-    if moved and (state.moving_level == 0.0 or level < state.moving_level):
-        state.moving_level = level
+    if moved and (state.rest.moving_activity == 0.0 or level < state.rest.moving_activity):
+        state.rest.moving_activity = level
     elif moved:
-        state.moving_level += FORGETTING * (level - state.moving_level)
-    elif rested and state.resting_level == 0.0:
-        state.resting_level = level
+        state.rest.moving_activity += FORGETTING * (level - state.rest.moving_activity)
+    elif rested and state.rest.resting_activity == 0.0:
+        state.rest.resting_activity = level
     elif rested:
-        state.resting_level += LEARNING * (min(level, LOUDEST * state.resting_level) - state.resting_level)
+        state.rest.resting_activity += LEARNING * (
+            min(level, LOUDEST * state.rest.resting_activity) - state.rest.resting_activity
+        )
 
 
 @njit
@@ -194,11 +232,11 @@ def is_resting(state, settings):
     if not (has_block(state) and is_steady(state, settings)):
         return False
     level = unrest(state, settings)
-    if level < 0.0 or state.stamp - state.moving_stamp <= EVIDENCE_LASTS:
+    if level < 0.0 or state.stamp - state.rest.moving_stamp <= EVIDENCE_LASTS:
         return False
-    if state.stamp - state.resting_stamp <= EVIDENCE_LASTS:
+    if state.stamp - state.rest.resting_stamp <= EVIDENCE_LASTS:
         return True
-    rest, motion = state.resting_level, state.moving_level
+    rest, motion = state.rest.resting_activity, state.rest.moving_activity
     if rest == 0.0 or level > AS_QUIET * rest:
         return False
     if motion > PLAINLY_LESS_QUIET * rest and level < math.sqrt(rest * motion):
@@ -229,9 +267,9 @@ def update_rest_evidence(state, aid):
     elif aid.stream == Stream.WHEEL:
         if abs(p[0]) < STANDING_SPEED and abs(p[1]) < STANDING_YAW_RATE:
             if p[3] > 0.0:
-                state.resting_stamp = aid.stamp
+                state.rest.resting_stamp = aid.stamp
         else:
-            state.moving_stamp = aid.stamp
+            state.rest.moving_stamp = aid.stamp
             return update_motion(state, abs(p[0]) - REST_SIGMAS * math.sqrt(max(p[3], 0.0)), aid.stamp, aid.stamp)
     elif aid.stream == Stream.BARO:
         note_pressure(state, aid)
@@ -242,9 +280,9 @@ def update_rest_evidence(state, aid):
 def weigh_speed(state, stamp, speed, std, is_whole):
     """Take a speed (m/s) as evidence; only one that ``is_whole``, with all three axes, can speak for rest."""
     if speed > max(MOTION_SIGMAS * std, LEAST_MOTION):
-        state.moving_stamp = stamp
+        state.rest.moving_stamp = stamp
     elif is_whole and speed < REST_SIGMAS * std and std < WORST_REST_STD:
-        state.resting_stamp = stamp
+        state.rest.resting_stamp = stamp
 
 
 @njit
@@ -253,35 +291,35 @@ def note_displacement(state, aid):
     fix = geodetic_to_ecef(aid.payload[0], aid.payload[1], aid.payload[2])
     variance = max(aid.payload[3], aid.payload[6], aid.payload[8])
     source = aid.source
-    age = aid.stamp - state.quiet_fix_stamp[source]
-    if state.quiet_fix_stamp[source] == NEVER or (state.quiet == 0 and age > WAY_LASTS):
-        state.quiet_fix_stamp[source] = aid.stamp
-        state.quiet_fix_variance[source] = variance
+    age = aid.stamp - state.rest.quiet_fix_stamp[source]
+    if state.rest.quiet_fix_stamp[source] == NEVER or (state.rest.quiet == 0 and age > WAY_LASTS):
+        state.rest.quiet_fix_stamp[source] = aid.stamp
+        state.rest.quiet_fix_variance[source] = variance
         for i in range(3):
-            state.quiet_fix_ecef[source, i] = fix[i]
+            state.rest.quiet_fix_ecef[source, i] = fix[i]
         return
-    start = state.quiet_fix_ecef[source]
+    start = state.rest.quiet_fix_ecef[source]
     way = (fix[0] - start[0], fix[1] - start[1], fix[2] - start[2])
-    distance, std = math.sqrt(dot(way, way)), math.sqrt(variance + state.quiet_fix_variance[source])
+    distance, std = math.sqrt(dot(way, way)), math.sqrt(variance + state.rest.quiet_fix_variance[source])
     if distance > DISPLACEMENT_SIGMAS * std:
-        state.moving_stamp = aid.stamp
-    elif state.quiet == 1 and distance < REST_SIGMAS * std and std < WORST_DISPLACEMENT_STD * age * 1e-9:
-        state.resting_stamp = aid.stamp
+        state.rest.moving_stamp = aid.stamp
+    elif state.rest.quiet == 1 and distance < REST_SIGMAS * std and std < WORST_DISPLACEMENT_STD * age * 1e-9:
+        state.rest.resting_stamp = aid.stamp
 
 
 @njit
 def note_pressure(state, aid):
     """Look whether the air pressure (Pa) has changed since the IMU became quiet: up and down is motion, too."""
-    if state.quiet == 0 or aid.stamp - state.quiet_pressure_stamp > PRESSURE_LASTS:
-        state.quiet_pressure_stamp = aid.stamp
-        state.quiet_pressure = aid.payload[0]
-    elif abs(aid.payload[0] - state.quiet_pressure) > DISPLACEMENT_SIGMAS * math.sqrt(2.0 * aid.payload[3]):
-        state.moving_stamp = aid.stamp
+    if state.rest.quiet == 0 or aid.stamp - state.rest.quiet_pressure_stamp > PRESSURE_LASTS:
+        state.rest.quiet_pressure_stamp = aid.stamp
+        state.rest.quiet_pressure = aid.payload[0]
+    elif abs(aid.payload[0] - state.rest.quiet_pressure) > DISPLACEMENT_SIGMAS * math.sqrt(2.0 * aid.payload[3]):
+        state.rest.moving_stamp = aid.stamp
 
 
 @njit
 def watch_wheels(state, aid):
     """Note when the wheels spoke, and when the gate refused to believe them: they slip."""
-    state.wheel_stamp = aid.stamp
+    state.rest.wheel_stamp = aid.stamp
     if aid.verdict == Verdict.GATE:
-        state.slip_stamp = aid.stamp
+        state.rest.slip_stamp = aid.stamp

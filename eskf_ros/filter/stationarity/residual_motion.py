@@ -9,11 +9,32 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from eskf_ros.compiled import njit
 from eskf_ros.filter.state.error_state import VELOCITY
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.geodesy.earth import EARTH_RATE
 from eskf_ros.geodesy.rotation import dot
+
+RESIDUAL_MOTION = np.dtype(
+    [
+        ("moved_first", "i8"),
+        ("part_start", "i8"),
+        ("part_count", "i8"),
+        ("part_sum", "f8", (6,)),
+        ("parts", "i8"),
+        ("part_mean_sum", "f8", (6,)),
+        ("part_square_sum", "f8", (6,)),
+        ("force_variance", "f8"),
+        ("rate_variance", "f8"),
+    ],
+    align=True,
+)
+"""Whether the robot moved when the window began; the part being filled, sums over the means of the others, and the
+largest
+variances of these means ((m/s2)2, (rad/s)2) in the run of still windows.
+"""
 
 PART = 250_000_000
 """Length of a part (ns)."""
@@ -36,29 +57,29 @@ BIAS_SIGMAS = 4.0
 @njit
 def add_to_part(state):
     """Add the newest IMU sample to the part of the stillness window, whose beginning begins the parts anew."""
-    if state.window_start == NEVER:
-        state.moved_first = 1 if is_moving(state) else 0
-        state.part_start = state.stamp
-        state.part_count = 0
-        state.parts = 0
+    if state.window.start == NEVER:
+        state.residual.moved_first = 1 if is_moving(state) else 0
+        state.residual.part_start = state.stamp
+        state.residual.part_count = 0
+        state.residual.parts = 0
         for i in range(6):
-            state.part_sum[i] = 0.0
-            state.part_mean_sum[i] = 0.0
-            state.part_square_sum[i] = 0.0
+            state.residual.part_sum[i] = 0.0
+            state.residual.part_mean_sum[i] = 0.0
+            state.residual.part_square_sum[i] = 0.0
     for i in range(3):
-        state.part_sum[i] += state.specific_force[i]
-        state.part_sum[3 + i] += state.angular_rate[i]
-    state.part_count += 1
-    if state.stamp - state.part_start < PART:
+        state.residual.part_sum[i] += state.specific_force[i]
+        state.residual.part_sum[3 + i] += state.angular_rate[i]
+    state.residual.part_count += 1
+    if state.stamp - state.residual.part_start < PART:
         return
     for i in range(6):
-        mean = state.part_sum[i] / state.part_count
-        state.part_mean_sum[i] += mean
-        state.part_square_sum[i] += mean * mean
-        state.part_sum[i] = 0.0
-    state.parts += 1
-    state.part_count = 0
-    state.part_start = state.stamp
+        mean = state.residual.part_sum[i] / state.residual.part_count
+        state.residual.part_mean_sum[i] += mean
+        state.residual.part_square_sum[i] += mean * mean
+        state.residual.part_sum[i] = 0.0
+    state.residual.parts += 1
+    state.residual.part_count = 0
+    state.residual.part_start = state.stamp
 
 
 @njit
@@ -79,14 +100,14 @@ def sway_variance(state, first, noise_density):
 
     0: of the force ((m/s2)2), 3: of the rate ((rad/s)2). The largest of the axes counts.
     """
-    n = state.parts
+    n = state.residual.parts
     if n < FEWEST_PARTS:
         return 0.0
     white = noise_density**2 / (PART * 1e-9)
     largest = 0.0
     for i in range(first, first + 3):
-        mean = state.part_mean_sum[i] / n
-        largest = max(largest, (state.part_square_sum[i] / n - mean * mean) * n / (n - 1))
+        mean = state.residual.part_mean_sum[i] / n
+        largest = max(largest, (state.residual.part_square_sum[i] / n - mean * mean) * n / (n - 1))
     return largest if largest > MORE_THAN_NOISE * white else 0.0
 
 
@@ -95,8 +116,8 @@ def note_sway(state, is_first, settings):
     """Keep the largest sway of an unbroken run of still windows, of which this is the first or a further one."""
     force = sway_variance(state, 0, settings.accel_noise_density)
     rate = sway_variance(state, 3, settings.gyro_noise_density)
-    state.sway_force = force if is_first else max(state.sway_force, force)
-    state.sway_rate = rate if is_first else max(state.sway_rate, rate)
+    state.residual.force_variance = force if is_first else max(state.residual.force_variance, force)
+    state.residual.rate_variance = rate if is_first else max(state.residual.rate_variance, rate)
 
 
 @njit

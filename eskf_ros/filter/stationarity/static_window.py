@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from enum import IntEnum
 
+import numpy as np
+
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import local_up
 from eskf_ros.filter.state.error_state import GYRO_BIAS, SOURCES
@@ -12,6 +14,30 @@ from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity.residual_motion import MOVING_SPEED
 from eskf_ros.geodesy.earth import STANDARD_GRAVITY, geodetic_to_ecef
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix
+
+STATIC_WINDOW = np.dtype(
+    [
+        ("start", "i8"),
+        ("samples", "i8"),
+        ("total", "f8", (6,)),
+        ("square_total", "f8", (6,)),
+        ("still_stamp", "i8"),
+        ("still_samples", "i8"),
+        ("still_total", "f8", (6,)),
+        ("motion_stamp", "i8"),
+        ("last_fix_stamp", "i8", (SOURCES,)),
+        ("last_fix_ecef", "f8", (SOURCES, 3)),
+        ("last_fix_variance", "f8", (SOURCES,)),
+        ("anchor_stamp", "i8", (SOURCES,)),
+        ("anchor_ecef", "f8", (SOURCES, 3)),
+    ],
+    align=True,
+)
+"""The static window being filled, the unbroken run of still windows before it, and evidence of motion from outside.
+
+Sums of force (m/s2) and rate (rad/s). ``motion_stamp``: when GNSS last proved motion. ``last_fix_*``: by receiver,
+whose antennas are apart; ``anchor_*``: the fix from which the window started.
+"""
 
 POSITION_SIGMAS = 5.0
 VELOCITY_SIGMAS = 3.0
@@ -50,53 +76,55 @@ def update_static_window(state, settings):
     """Add the newest IMU sample to the static window; return its `Window`. The caller closes one that is full."""
     if state.first_stamp == NEVER:
         state.first_stamp = state.stamp
-    if state.imu_interval > settings.imu_gap:
+    if state.imu.interval > settings.imu_gap:
         # What a hole hides belongs to no window.
-        state.window_start = NEVER
-        state.still_count = 0
-    if state.window_start == NEVER:
-        state.window_start = state.stamp
-        state.window_count = 0
+        state.window.start = NEVER
+        state.window.still_samples = 0
+    if state.window.start == NEVER:
+        state.window.start = state.stamp
+        state.window.samples = 0
         for source in range(SOURCES):
-            state.anchor_stamp[source] = state.last_fix_stamp[source]
+            state.window.anchor_stamp[source] = state.window.last_fix_stamp[source]
             for i in range(3):
-                state.anchor_ecef[source, i] = state.last_fix_ecef[source, i]
+                state.window.anchor_ecef[source, i] = state.window.last_fix_ecef[source, i]
         for i in range(6):
-            state.window_sum[i] = 0.0
-            state.window_square_sum[i] = 0.0
+            state.window.total[i] = 0.0
+            state.window.square_total[i] = 0.0
     for i in range(3):
-        state.window_sum[i] += state.specific_force[i]
-        state.window_square_sum[i] += state.specific_force[i] ** 2
-        state.window_sum[3 + i] += state.angular_rate[i]
-        state.window_square_sum[3 + i] += state.angular_rate[i] ** 2
-    state.window_count += 1
-    duration = (state.stamp - state.window_start) * 1e-9
-    if duration < settings.static_duration or state.window_count < MINIMUM_WINDOW_SAMPLES:
+        state.window.total[i] += state.specific_force[i]
+        state.window.square_total[i] += state.specific_force[i] ** 2
+        state.window.total[3 + i] += state.angular_rate[i]
+        state.window.square_total[3 + i] += state.angular_rate[i] ** 2
+    state.window.samples += 1
+    duration = (state.stamp - state.window.start) * 1e-9
+    if duration < settings.static_duration or state.window.samples < MINIMUM_WINDOW_SAMPLES:
         return Window.OPEN
-    still = is_still(state, settings) and state.motion_stamp < state.window_start and is_same_rest(state, settings)
+    still = (
+        is_still(state, settings) and state.window.motion_stamp < state.window.start and is_same_rest(state, settings)
+    )
     window = Window.REST if still else Window.MOTION
     if (
         still
         and state.position_known == 1
-        and max(state.last_fix_stamp.max(), state.resting_stamp) < state.window_start
+        and max(state.window.last_fix_stamp.max(), state.rest.resting_stamp) < state.window.start
     ):
         window = Window.UNPROVEN
     if window != Window.REST:
-        state.still_count = 0
+        state.window.still_samples = 0
     else:
-        if state.still_count == 0:
+        if state.window.still_samples == 0:
             for i in range(6):
-                state.still_sum[i] = 0.0
-        state.still_count += state.window_count
+                state.window.still_total[i] = 0.0
+        state.window.still_samples += state.window.samples
         for i in range(6):
-            state.still_sum[i] += state.window_sum[i]
+            state.window.still_total[i] += state.window.total[i]
     return window
 
 
 @njit
 def close_static_window(state):
     """Let the next IMU sample begin a new window."""
-    state.window_start = NEVER
+    state.window.start = NEVER
 
 
 @njit
@@ -111,15 +139,15 @@ def update_evidence_from_fix(state, aid):
 def update_evidence_from_place(state, ecef, std, stamp, source):
     """Remember the place (m) of an antenna, and look how far it is from that before the current static window."""
     is_disproved = False
-    if NEVER < state.anchor_stamp[source] < stamp:
-        a = state.anchor_ecef[source]
+    if NEVER < state.window.anchor_stamp[source] < stamp:
+        a = state.window.anchor_ecef[source]
         step = (ecef[0] - a[0], ecef[1] - a[1], ecef[2] - a[2])
-        seconds = (stamp - state.anchor_stamp[source]) * 1e-9
+        seconds = (stamp - state.window.anchor_stamp[source]) * 1e-9
         speed = (math.sqrt(dot(step, step)) - POSITION_SIGMAS * math.sqrt(2.0) * std) / seconds
-        is_disproved = update_motion(state, speed, state.anchor_stamp[source], stamp)
-    state.last_fix_stamp[source] = stamp
+        is_disproved = update_motion(state, speed, state.window.anchor_stamp[source], stamp)
+    state.window.last_fix_stamp[source] = stamp
     for i in range(3):
-        state.last_fix_ecef[source, i] = ecef[i]
+        state.window.last_fix_ecef[source, i] = ecef[i]
     return is_disproved
 
 
@@ -140,18 +168,18 @@ def update_motion(state, speed, since, stamp):
     """
     if speed <= MOVING_SPEED:
         return False
-    state.motion_stamp = stamp
-    state.moving_stamp = stamp
-    waiting = state.heading_known == 0 and state.level_known == 1 and state.still_stamp != NEVER
-    return waiting and speed > MOVING_SPEED + STRONGEST_START * (stamp - min(since, state.still_stamp)) * 1e-9
+    state.window.motion_stamp = stamp
+    state.rest.moving_stamp = stamp
+    waiting = state.heading_known == 0 and state.level_known == 1 and state.window.still_stamp != NEVER
+    return waiting and speed > MOVING_SPEED + STRONGEST_START * (stamp - min(since, state.window.still_stamp)) * 1e-9
 
 
 @njit
 def is_still(state, settings):
     """Say whether the spread of the readings in the full window is that of a robot at rest."""
     for i in range(6):
-        mean = state.window_sum[i] / state.window_count
-        variance = state.window_square_sum[i] / state.window_count - mean * mean
+        mean = state.window.total[i] / state.window.samples
+        variance = state.window.square_total[i] / state.window.samples - mean * mean
         limit = settings.still_accel_std if i < 3 else settings.still_gyro_std
         if variance > limit * limit:
             return False
@@ -165,22 +193,22 @@ def is_same_rest(state, settings):
     A creeping turn is as quiet as rest, but its rate is none that the bias can have come to since. A steady
     acceleration looks like a tilt, but one that no gyro has seen.
     """
-    if state.level_known == 0 or state.still_stamp == NEVER:
+    if state.level_known == 0 or state.window.still_stamp == NEVER:
         return True
-    n = state.window_count
-    earth = rotate_back(to_matrix(state.attitude), state.earth_rate_map)
-    noise = settings.gyro_noise_density**2 / ((state.stamp - state.window_start) * 1e-9)
-    walked = settings.gyro_bias_random_walk**2 * (state.stamp - state.still_stamp) * 1e-9
+    n = state.window.samples
+    earth = rotate_back(to_matrix(state.attitude), state.frame.earth_rate_map)
+    noise = settings.gyro_noise_density**2 / ((state.stamp - state.window.start) * 1e-9)
+    walked = settings.gyro_bias_random_walk**2 * (state.stamp - state.window.still_stamp) * 1e-9
     for i in range(3):
-        excess = state.window_sum[3 + i] / n - state.gyro_bias[i] - earth[i]
+        excess = state.window.total[3 + i] / n - state.gyro_bias[i] - earth[i]
         variance = state.covariance[GYRO_BIAS + i, GYRO_BIAS + i] + noise + walked
         if excess * excess > REST_RATE_SIGMAS**2 * variance:
             return False
-    force = (state.window_sum[0] / n, state.window_sum[1] / n, state.window_sum[2] / n)
+    force = (state.window.total[0] / n, state.window.total[1] / n, state.window.total[2] / n)
     force_map = rotate(to_matrix(state.attitude), force)
     sideways = cross(local_up(state), force_map)
     bias_variance = 0.0
     for i in range(3):
         bias_variance = max(bias_variance, state.covariance[GYRO_BIAS + i, GYRO_BIAS + i])
-    drift = 3.0 * math.sqrt(bias_variance) * (state.stamp - state.still_stamp) * 1e-9
+    drift = 3.0 * math.sqrt(bias_variance) * (state.stamp - state.window.still_stamp) * 1e-9
     return math.sqrt(dot(sideways, sideways)) < REST_TOLERANCE + STANDARD_GRAVITY * drift

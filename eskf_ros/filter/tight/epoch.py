@@ -19,6 +19,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.first_fix import reset_position_to_fix
 from eskf_ros.filter.alignment.heading import reset_heading_from_memory, search_with
@@ -62,6 +64,19 @@ from eskf_ros.geodesy.earth import SEMI_MAJOR_AXIS, ecef_to_geodetic
 from eskf_ros.geodesy.rotation import cross, dot, rotate, to_matrix
 from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, Status
 from eskf_ros.gnss.signals import SPEED_OF_LIGHT
+
+TIGHT = np.dtype(
+    [
+        ("clock_known", "i8", (2,)),
+        ("clock_jumps", "i8"),
+        ("range_faults", "i8"),
+    ],
+    align=True,
+)
+"""Tight coupling: whether clock bias and drift have values yet, milliseconds the clock has jumped by, and how often
+most
+of the satellites contradicted the state.
+"""
 
 LARGEST_EPOCH = 256
 """So many signals of an epoch are looked at together."""
@@ -321,7 +336,7 @@ def reset_clock(state, which, shift, settings):
     value = state.optional[place - ERROR_SIZE] + shift
     reset_augmented(state, place, 1, settings)
     state.optional[place - ERROR_SIZE] = value
-    state.clock_known[which] = 1
+    state.tight.clock_known[which] = 1
 
 
 @njit
@@ -331,7 +346,7 @@ def reset_or_jump_clock(state, aids, first, end, which, settings, work):
         return
     common = median(work.signal_innovation, work.signal_count, work)
     place = settings.clock_at + which
-    if state.clock_known[which] == 0 or state.covariance[place, place] > LOST_CLOCK[which] ** 2:
+    if state.tight.clock_known[which] == 0 or state.covariance[place, place] > LOST_CLOCK[which] ** 2:
         reset_clock(state, which, common, settings)
         gather(state, aids, first, end, settings, work)
         return
@@ -345,7 +360,7 @@ def reset_or_jump_clock(state, aids, first, end, which, settings, work):
             agreeing += 1
     if 2 * agreeing > work.signal_count:
         state.optional[place - ERROR_SIZE] += jump * MILLISECOND
-        state.clock_jumps += abs(jump)
+        state.tight.clock_jumps += abs(jump)
         gather(state, aids, first, end, settings, work)
 
 
@@ -371,7 +386,7 @@ def inflate_or_reset_by_majority(state, aids, first, end, which, settings, work)
         reset_clock(state, which, common, settings)
         gather(state, aids, first, end, settings, work)
     elif count >= FEWEST_TO_JUDGE:
-        state.range_faults += 1
+        state.tight.range_faults += 1
         for k in range(count):
             work.signal_square[k] = work.signal_innovation[k] ** 2
         fault = median(work.signal_square, count, work) / MEDIAN_OF_SQUARES
@@ -498,8 +513,8 @@ def note_solution(state, stamp, which, settings, work):
         base = state.velocity_map
     measured = (base[0] + lever[0] + step[0], base[1] + lever[1] + step[1], base[2] + lever[2] + step[2])
     if which == 0:
-        offset = rotate(state.map_to_ecef, measured)
-        origin = state.origin_ecef
+        offset = rotate(state.frame.map_to_ecef, measured)
+        origin = state.frame.origin_ecef
         ecef = (origin[0] + offset[0], origin[1] + offset[1], origin[2] + offset[2])
         if update_evidence_from_place(state, ecef, std, stamp, 0):
             reset_level_to_moving(state, settings)
@@ -577,8 +592,8 @@ def note_coarsely(state, aids, first, end, which, settings, work):
             std = math.sqrt(max(work.normal[0, 0], work.normal[1, 1], work.normal[2, 2]))
             if update_evidence_from_place(state, position, std, stamp, 0):
                 reset_level_to_moving(state, settings)
-    elif state.last_fix_stamp[0] != NEVER:
-        fix = state.last_fix_ecef[0]
+    elif state.window.last_fix_stamp[0] != NEVER:
+        fix = state.window.last_fix_ecef[0]
         gather_coarsely(aids, first, end, (fix[0], fix[1], fix[2]), 1, COARSE_STD[1], work)
         if solve_epoch(work):
             step = (work.step[0], work.step[1], work.step[2])
@@ -593,26 +608,26 @@ def start(state, aids, first, end, settings, work):
     found, ecef = locate_coarsely(aids, first, end, work)
     if not found:
         return
-    had_datum = state.datum_known
+    had_datum = state.frame.datum_known
     # Now with atmosphere, weights and the elevation mask.
     for _ in range(2):
-        state.datum_known = had_datum
+        state.frame.datum_known = had_datum
         reset_position_to_fix(state, ecef_to_geodetic(ecef[0], ecef[1], ecef[2]))
-        state.clock_known[0] = 0
+        state.tight.clock_known[0] = 0
         join_offsets(state, aids, first, end, settings)
         gather(state, aids, first, end, settings, work)
         reset_or_jump_clock(state, aids, first, end, 0, settings, work)
         if not solve_epoch(work) or spread_of(work) > POOREST_STD:
             state.position_known = 0
-            state.datum_known = had_datum
+            state.frame.datum_known = had_datum
             return
         antenna, _ = antenna_ecef(state, settings)
-        step = rotate(state.map_to_ecef, work.step)
+        step = rotate(state.frame.map_to_ecef, work.step)
         ecef = (antenna[0] + step[0], antenna[1] + step[1], antenna[2] + step[2])
     geodetic = ecef_to_geodetic(ecef[0], ecef[1], ecef[2])
-    state.datum_known = had_datum
+    state.frame.datum_known = had_datum
     reset_position_to_fix(state, geodetic)
-    state.clock_known[0] = 0
+    state.tight.clock_known[0] = 0
     variance = max(work.normal[0, 0], work.normal[1, 1], work.normal[2, 2])
     fix = (geodetic[0], geodetic[1], geodetic[2], variance, 0.0, 0.0, variance, 0.0, variance)
     reset_heading_from_memory(state, fix, settings)

@@ -77,7 +77,7 @@ def linearize(state, payload, settings, work):
     sway = rotate(rotation, cross(body_rate(state, rotation), arm))
     across = cross(unit, lever)
     # The gyro reading of this instant carries the white noise of one sample.
-    gyro_variance = settings.gyro_noise_density**2 / state.imu_interval * dot(across, across)
+    gyro_variance = settings.gyro_noise_density**2 / state.imu.interval * dot(across, across)
     work.noise[0, 0] = variance(payload, settings) + gyro_variance
     for i in range(3):
         work.jacobian[0, POSITION + i] = -turning[i]
@@ -87,7 +87,7 @@ def linearize(state, payload, settings, work):
         work.noise[0, 0] += dot(sway, sway)
         return SIZE
     # An attitude error turns the sway, and the Earth rate into the body: [lever]x [Earth rate]x theta.
-    earth = state.earth_rate_map
+    earth = state.frame.earth_rate_map
     swayed = cross(unit, sway)
     # It moves the antenna too, and so turns the line of sight.
     moved = cross(turning, lever)

@@ -78,9 +78,9 @@ def antenna_ecef(state, settings):
     p, v = state.position_map, state.velocity_map
     lever = rotate(rotation, arm)
     sway = rotate(rotation, cross(body_rate(state, rotation), arm))
-    offset = rotate(state.map_to_ecef, (p[0] + lever[0], p[1] + lever[1], p[2] + lever[2]))
-    velocity = rotate(state.map_to_ecef, (v[0] + sway[0], v[1] + sway[1], v[2] + sway[2]))
-    origin = state.origin_ecef
+    offset = rotate(state.frame.map_to_ecef, (p[0] + lever[0], p[1] + lever[1], p[2] + lever[2]))
+    velocity = rotate(state.frame.map_to_ecef, (v[0] + sway[0], v[1] + sway[1], v[2] + sway[2]))
+    origin = state.frame.origin_ecef
     return (origin[0] + offset[0], origin[1] + offset[1], origin[2] + offset[2]), velocity
 
 
@@ -100,4 +100,4 @@ def see(payload, position, velocity):
 @njit
 def to_map(state, vector_ecef):
     """Return a vector in map axes."""
-    return rotate_back(state.map_to_ecef, vector_ecef)
+    return rotate_back(state.frame.map_to_ecef, vector_ecef)

@@ -7,24 +7,27 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.integrity.imu_monitor import BIASED_WINDOWS, FASTEST_TURN, GRAVITY_TOLERANCE
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.time import NEVER
-from eskf_ros.filter.stationarity.residual_motion import can_be_bias
 from eskf_ros.geodesy.earth import STANDARD_GRAVITY
-from eskf_ros.geodesy.rotation import dot, rotate, wrapped
+from eskf_ros.geodesy.rotation import wrapped
 
-NO_GRAVITY = 0.5
-"""Below this part of gravity on average the accelerometer cannot be a strapdown one in m/s2, at rest or not."""
+HEADING_MONITOR = np.dtype(
+    [
+        ("sensor_contrast", "f8", (2, 3)),
+        ("course_contrast", "f8", (3,)),
+        ("field_found", "f8", (2,)),
+        ("disturbed_fields", "f8"),
+        ("field_count", "f8"),
+    ],
+    align=True,
+)
+"""Sums of cosine and sine of a difference, and how many: dual antenna and magnetometer against the estimate, course
+over
+ground against the estimate. Strength (T) and inclination (rad) of the field last measured; disturbed fields, and all.
+"""
 
-GRAVITY_TOLERANCE = 0.2
-UPRIGHT_COSINE = 0.7
-FASTEST_TURN = 15.0
-"""At rest gravity is within this part of its value and within 45 degrees of the z axis of base_link; nothing that
-navigates turns this fast (rad/s) for seconds."""
-
-SAME_RATE = 0.1
-BIASED_WINDOWS = 3
-"""A rate that changes by less than this part from window to window, through so many, is a bias: nothing turns so."""
 
 MEMORY = 0.99
 LASTING_COUNT = 40.0
@@ -43,48 +46,6 @@ REFUSED_CAUSES = {
 
 
 @njit
-def watch_input(state, still, settings):
-    """Judge the full stillness window: strength of gravity, its direction in base_link, size of the rates."""
-    n = state.window_count
-    force = (state.window_sum[0] / n, state.window_sum[1] / n, state.window_sum[2] / n)
-    rate = (state.window_sum[3] / n, state.window_sum[4] / n, state.window_sum[5] / n)
-    strength = math.sqrt(dot(force, force))
-    state.windows += 1
-    odd = strength < NO_GRAVITY * STANDARD_GRAVITY
-    if still and abs(strength / STANDARD_GRAVITY - 1.0) > GRAVITY_TOLERANCE:
-        odd = True
-    if odd:
-        state.odd_gravity_windows += 1
-        state.odd_gravity = strength
-    elif still:
-        watch_bias(state, rate, settings)
-        state.rest_windows += 1
-        force_base = rotate(settings.imu_to_base, force)
-        if force_base[2] < UPRIGHT_COSINE * strength:
-            state.tilted_windows += 1
-            for i in range(3):
-                state.tilted_force[i] = force_base[i]
-    if math.sqrt(dot(rate, rate)) > FASTEST_TURN:
-        state.fast_windows += 1
-
-
-@njit
-def watch_bias(state, rate, settings):
-    """Count still windows in a row with one mean rate (rad/s) that is too large for what is expected of the bias."""
-    nothing = (0.0, 0.0, 0.0)
-    if can_be_bias(rate, nothing, settings.gyro_bias_std, 0.0):
-        state.biased_windows = 0
-        return
-    last = state.biased_rate
-    change = (rate[0] - last[0], rate[1] - last[1], rate[2] - last[2])
-    if dot(change, change) > SAME_RATE**2 * dot(rate, rate):
-        state.biased_windows = 0
-    state.biased_windows += 1
-    for i in range(3):
-        state.biased_rate[i] = rate[i]
-
-
-@njit
 def note_contrast(sums, angle):
     """Add an angle (rad) to sums of cosine, sine and count that forget."""
     sums[0] = MEMORY * sums[0] + math.cos(angle)
@@ -97,14 +58,16 @@ def watch_heading(state, aid, work):
     """Compare a heading of the dual antenna or the magnetometer, described by ``work``, with the estimate."""
     if aid.source == 0 and state.heading_known == 1 and aid.payload[3] > 0.0:
         kind = 1 if aid.stream == Stream.MAG else 0
-        note_contrast(state.heading_contrast[kind], work.innovation[0])
+        note_contrast(state.heading_monitor.sensor_contrast[kind], work.innovation[0])
 
 
 @njit
 def watch_field(state, is_disturbed):
     """Count the readings of the magnetometer that cannot be the Earth's field; the counts forget."""
-    state.fields = MEMORY * state.fields + 1.0
-    state.disturbed_fields = MEMORY * state.disturbed_fields + (1.0 if is_disturbed else 0.0)
+    state.heading_monitor.field_count = MEMORY * state.heading_monitor.field_count + 1.0
+    state.heading_monitor.disturbed_fields = MEMORY * state.heading_monitor.disturbed_fields + (
+        1.0 if is_disturbed else 0.0
+    )
 
 
 @njit
@@ -114,7 +77,7 @@ def watch_course(state, aid, heading, settings):
     std = math.sqrt(max(aid.payload[3], aid.payload[6]))
     fast = math.hypot(east, north) > max(settings.course_min_speed, 10.0 * std)
     if settings.use_course == 1 and state.heading_known == 1 and fast:
-        note_contrast(state.course_contrast, wrapped(math.atan2(north, east) - heading))
+        note_contrast(state.heading_monitor.course_contrast, wrapped(math.atan2(north, east) - heading))
 
 
 def _lasting_difference(sums: np.ndarray) -> float | None:
@@ -128,16 +91,16 @@ def _lasting_difference(sums: np.ndarray) -> float | None:
 
 def is_heading_contradicted(state: np.void) -> bool:
     """Say whether the dual antenna or the magnetometer tell another heading than the estimate for long."""
-    return any(_lasting_difference(sums) is not None for sums in state["heading_contrast"])
+    return any(_lasting_difference(sums) is not None for sums in state["heading_monitor"]["sensor_contrast"])
 
 
 def _refused_complaints(state: np.void) -> list[str]:
     """Name the aids that are refused without end: one sentence each."""
     found = []
     for stream, causes in REFUSED_CAUSES.items():
-        count = int(state["aid_rejected"][stream, 0])
-        since = (int(state["stamp"]) - int(state["aid_fused_stamp"][stream, 0])) * 1e-9
-        last = (int(state["stamp"]) - int(state["aid_stamp"][stream, 0])) * 1e-9
+        count = int(state["streams"]["rejected"][stream, 0])
+        since = (int(state["stamp"]) - int(state["streams"]["fused_stamp"][stream, 0])) * 1e-9
+        last = (int(state["stamp"]) - int(state["streams"]["last_stamp"][stream, 0])) * 1e-9
         if count > LASTING_COUNT and since > LONG_REFUSED > last:
             found.append(f"{count} messages of {stream.name.lower()} in a row contradict the estimate: {causes}")
     return found
@@ -145,22 +108,24 @@ def _refused_complaints(state: np.void) -> list[str]:
 
 def _heading_complaints(state: np.void) -> list[str]:
     found = []
-    if state["disturbed_fields"] > max(LASTING_COUNT, ALIKE * float(state["fields"])):
-        strength, inclination = (float(value) for value in state["field_found"])
+    if state["heading_monitor"]["disturbed_fields"] > max(
+        LASTING_COUNT, ALIKE * float(state["heading_monitor"]["field_count"])
+    ):
+        strength, inclination = (float(value) for value in state["heading_monitor"]["field_found"])
         found.append(
             f"the magnetic field is {strength * 1e6:.0f} uT and dips by {math.degrees(inclination):.0f} deg, that of "
-            f"the Earth is {float(state['field_strength']) * 1e6:.0f} uT and dips by "
-            f"{math.degrees(state['field_inclination']):.0f} deg: does mag.mount_rpy_deg match its axes (a driver may "
+            f"the Earth is {float(state['mag']['strength']) * 1e6:.0f} uT and dips by "
+            f"{math.degrees(state['mag']['inclination']):.0f} deg: does mag.mount_rpy_deg match its axes (a driver may "
             "give north-east-down), is it in T, and is it calibrated?"
         )
-    if state["heading_disputed"] and not state["heading_known"]:
+    if state["heading"]["disputed"] and not state["heading_known"]:
         found.append(
             "the dual antenna and the heading that was given (alignment.initial_heading_deg, warm start, initialpose) "
             "contradict each other: which one is right is known when the robot speeds up or turns"
         )
-    dual_antenna, magnetometer = state["heading_contrast"]
+    dual_antenna, magnetometer = state["heading_monitor"]["sensor_contrast"]
     given = ""
-    if state["given_stamp"] != NEVER:
+    if state["heading"]["given_stamp"] != NEVER:
         given = " Or is the heading wrong that was given (alignment.initial_heading_deg, warm start, initialpose)?"
     difference = _lasting_difference(magnetometer)
     if difference is not None:
@@ -174,7 +139,7 @@ def _heading_complaints(state: np.void) -> list[str]:
             f"the headings of the dual antenna differ from the estimate by {difference:.0f} deg: are the antennas "
             "swapped, does heading.mount_rpy_deg match the baseline, and is yaw 0 = east, counter-clockwise?" + given
         )
-    difference = _lasting_difference(state["course_contrast"])
+    difference = _lasting_difference(state["heading_monitor"]["course_contrast"])
     if difference is not None and dual_antenna[2] > 0.0:
         found.append(
             f"the vehicle travels at {difference:.0f} deg to the heading of the dual antenna: are the antennas "
@@ -187,27 +152,27 @@ def _heading_complaints(state: np.void) -> list[str]:
 def complaints(state: np.void) -> list[str]:
     """Say in one sentence each what is wrong with the IMU stream, and what to do; empty when nothing is."""
     found = []
-    if state["odd_gravity_windows"] > max(1, int(state["windows"]) // 4):
-        strength = float(state["odd_gravity"])
+    if state["imu_monitor"]["odd_gravity_windows"] > max(1, int(state["imu_monitor"]["windows"]) // 4):
+        strength = float(state["imu_monitor"]["odd_gravity"])
         cause = "is its scale right?"
         if strength < 0.05 * STANDARD_GRAVITY:
             cause = "the driver removes gravity; publish the raw specific force (REP-145: +g up at rest)"
         elif abs(strength - 1.0) < GRAVITY_TOLERANCE:
             cause = "it is in units of g; REP-103 wants m/s2"
         found.append(f"the accelerometer reads {strength:.2f} m/s2 where gravity is {STANDARD_GRAVITY:.2f}: {cause}")
-    if state["biased_windows"] >= BIASED_WINDOWS:
-        x, y, z = np.degrees(state["biased_rate"])
+    if state["imu_monitor"]["biased_windows"] >= BIASED_WINDOWS:
+        x, y, z = np.degrees(state["imu_monitor"]["biased_rate"])
         found.append(
             f"at rest the gyro reads ({x:.2f}, {y:.2f}, {z:.2f}) deg/s, more than imu.gyro_bias_std allows for: raise "
             "it, or calibrate the gyro"
         )
-    if state["tilted_windows"] > max(1, int(state["rest_windows"]) // 4):
-        x, y, z = (float(value) for value in state["tilted_force"])
+    if state["imu_monitor"]["tilted_windows"] > max(1, int(state["imu_monitor"]["rest_windows"]) // 4):
+        x, y, z = (float(value) for value in state["imu_monitor"]["tilted_force"])
         found.append(
             f"at rest gravity is ({x:.1f}, {y:.1f}, {z:.1f}) m/s2 in base_link, not along +z: imu.mount_rpy_deg does "
             "not match the mounting, or the driver publishes North-East-Down axes"
         )
-    if state["fast_windows"] > 0:
+    if state["imu_monitor"]["fast_windows"] > 0:
         found.append(
             f"the gyro reads more than {FASTEST_TURN:.0f} rad/s for seconds: is it in deg/s? REP-103 wants rad/s"
         )

@@ -1,0 +1,89 @@
+"""Monitor of the IMU: gravity, mounting and rates, judged over static windows."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.stationarity.residual_motion import can_be_bias
+from eskf_ros.geodesy.earth import STANDARD_GRAVITY
+from eskf_ros.geodesy.rotation import dot, rotate
+
+IMU_MONITOR = np.dtype(
+    [
+        ("windows", "i8"),
+        ("rest_windows", "i8"),
+        ("odd_gravity_windows", "i8"),
+        ("odd_gravity", "f8"),
+        ("tilted_windows", "i8"),
+        ("tilted_force", "f8", (3,)),
+        ("fast_windows", "i8"),
+        ("biased_windows", "i8"),
+        ("biased_rate", "f8", (3,)),
+    ],
+    align=True,
+)
+"""Static windows seen, those at rest, and those in which the IMU cannot be what it should be; still windows in a row
+with
+the same mean rate (rad/s), which is too large for a bias.
+"""
+
+NO_GRAVITY = 0.5
+"""Below this part of gravity on average the accelerometer cannot be a strapdown one in m/s2, at rest or not."""
+
+GRAVITY_TOLERANCE = 0.2
+
+UPRIGHT_COSINE = 0.7
+
+FASTEST_TURN = 15.0
+"""At rest gravity is within this part of its value and within 45 degrees of the z axis of base_link; nothing that
+navigates turns this fast (rad/s) for seconds."""
+
+SAME_RATE = 0.1
+
+BIASED_WINDOWS = 3
+"""A rate that changes by less than this part from window to window, through so many, is a bias: nothing turns so."""
+
+
+@njit
+def watch_input(state, still, settings):
+    """Judge the full stillness window: strength of gravity, its direction in base_link, size of the rates."""
+    n = state.window.samples
+    force = (state.window.total[0] / n, state.window.total[1] / n, state.window.total[2] / n)
+    rate = (state.window.total[3] / n, state.window.total[4] / n, state.window.total[5] / n)
+    strength = math.sqrt(dot(force, force))
+    state.imu_monitor.windows += 1
+    odd = strength < NO_GRAVITY * STANDARD_GRAVITY
+    if still and abs(strength / STANDARD_GRAVITY - 1.0) > GRAVITY_TOLERANCE:
+        odd = True
+    if odd:
+        state.imu_monitor.odd_gravity_windows += 1
+        state.imu_monitor.odd_gravity = strength
+    elif still:
+        watch_bias(state, rate, settings)
+        state.imu_monitor.rest_windows += 1
+        force_base = rotate(settings.imu_to_base, force)
+        if force_base[2] < UPRIGHT_COSINE * strength:
+            state.imu_monitor.tilted_windows += 1
+            for i in range(3):
+                state.imu_monitor.tilted_force[i] = force_base[i]
+    if math.sqrt(dot(rate, rate)) > FASTEST_TURN:
+        state.imu_monitor.fast_windows += 1
+
+
+@njit
+def watch_bias(state, rate, settings):
+    """Count still windows in a row with one mean rate (rad/s) that is too large for what is expected of the bias."""
+    nothing = (0.0, 0.0, 0.0)
+    if can_be_bias(rate, nothing, settings.gyro_bias_std, 0.0):
+        state.imu_monitor.biased_windows = 0
+        return
+    last = state.imu_monitor.biased_rate
+    change = (rate[0] - last[0], rate[1] - last[1], rate[2] - last[2])
+    if dot(change, change) > SAME_RATE**2 * dot(rate, rate):
+        state.imu_monitor.biased_windows = 0
+    state.imu_monitor.biased_windows += 1
+    for i in range(3):
+        state.imu_monitor.biased_rate[i] = rate[i]

@@ -1,0 +1,269 @@
+"""Memory layout of the estimator: the records of the rooms put together.
+
+Everything the compiled kernels touch is a numpy record with named fields, so that ``state.position_map`` is the same
+code compiled and plain, and a checkpoint is one assignment. Units are SI; stamps are integer nanoseconds. A room
+defines its own record, in the file that writes it; a kernel says with ``state.ROOM.field`` whose memory it touches.
+
+Body axes are the axes of the IMU and the body origin is the IMU: biases, noise and lever arms live there.
+``output/global_odometry.py`` turns the result into base_link.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from eskf_ros.filter.alignment.heading_search import SEARCH
+from eskf_ros.filter.alignment.heading_sensors import CANDIDATE
+from eskf_ros.filter.alignment.levelling import LEVELLING
+from eskf_ros.filter.inertial.navigation_frame import FRAME
+from eskf_ros.filter.inertial.strapdown import IMU_READINGS
+from eskf_ros.filter.integrity.fix_tracker import FIX_TRACKER
+from eskf_ros.filter.integrity.heading_monitor import HEADING_MONITOR
+from eskf_ros.filter.integrity.imu_monitor import IMU_MONITOR
+from eskf_ros.filter.integrity.receiver_monitor import RECEIVER_MONITOR
+from eskf_ros.filter.integrity.recovery import RECOVERY
+from eskf_ros.filter.measurements.mag import EARTH_FIELD
+from eskf_ros.filter.output.local_odometry import STEP
+from eskf_ros.filter.state.enums import Stream
+from eskf_ros.filter.state.error_state import (
+    ACCEL_BIAS,
+    ERROR_CAPACITY,
+    ERROR_SIZE,
+    OPTIONAL_CAPACITY,
+    OPTIONAL_SIZES,
+    SOURCES,
+)
+from eskf_ros.filter.state.memory import allocate
+from eskf_ros.filter.state.streams import STREAMS
+from eskf_ros.filter.state.time import NEVER
+from eskf_ros.filter.stationarity.detector import REST
+from eskf_ros.filter.stationarity.residual_motion import RESIDUAL_MOTION
+from eskf_ros.filter.stationarity.static_window import STATIC_WINDOW
+from eskf_ros.filter.tight.epoch import LARGEST_EPOCH, TIGHT
+
+STATE = np.dtype(
+    [
+        # Where the estimator stands in the timeline.
+        ("stamp", "i8"),
+        ("imu_next", "i8"),
+        ("aid_next", "i8"),
+        # Nominal state at ``stamp``; attitude is the quaternion (w x y z) from body to map.
+        ("position_map", "f8", (3,)),
+        ("velocity_map", "f8", (3,)),
+        ("attitude", "f8", (4,)),
+        ("accel_bias", "f8", (3,)),
+        ("gyro_bias", "f8", (3,)),
+        # Augmented states in the order of their places; how many errors are in use, the core's included.
+        ("optional", "f8", (OPTIONAL_CAPACITY,)),
+        ("error_size", "i8"),
+        # Covariance of the first ``error_size`` errors; the attitude error is a small rotation on the map side.
+        ("covariance", "f8", (ERROR_CAPACITY, ERROR_CAPACITY)),
+        # Raw IMU reading at ``stamp``.
+        ("specific_force", "f8", (3,)),
+        ("angular_rate", "f8", (3,)),
+        # How far the start is, the first stamp of this start, and how often it was started again.
+        ("level_known", "i8"),
+        ("position_known", "i8"),
+        ("heading_known", "i8"),
+        ("first_stamp", "i8"),
+        ("restarts", "i8"),
+        # The records of the rooms.
+        ("imu", IMU_READINGS),
+        ("frame", FRAME),
+        ("odom", STEP),
+        ("search", SEARCH),
+        ("heading", CANDIDATE),
+        ("window", STATIC_WINDOW),
+        ("residual", RESIDUAL_MOTION),
+        ("rest", REST),
+        ("levelling", LEVELLING),
+        ("imu_monitor", IMU_MONITOR),
+        ("heading_monitor", HEADING_MONITOR),
+        ("recovery", RECOVERY),
+        ("receiver", RECEIVER_MONITOR),
+        ("mag", EARTH_FIELD),
+        ("tight", TIGHT),
+        ("streams", STREAMS),
+        ("tracker", FIX_TRACKER),
+    ],
+    align=True,
+)
+"""One state of the estimator: all it knows and all it decides with. Copying it is a checkpoint."""
+
+SETTINGS = np.dtype(
+    [
+        ("gyro_noise_density", "f8"),
+        ("accel_noise_density", "f8"),
+        ("gyro_bias_random_walk", "f8"),
+        ("accel_bias_random_walk", "f8"),
+        ("gyro_bias_std", "f8"),
+        ("accel_bias_std", "f8"),
+        ("imu_gap", "f8"),
+        ("gap_accel_std", "f8"),
+        ("gap_gyro_std", "f8"),
+        ("imu_to_base", "f8", (3, 3)),
+        ("imu_position_base", "f8", (3,)),
+        ("lever_arms_body", "f8", (SOURCES, 3)),
+        ("gnss_time_offset", "f8", (SOURCES,)),
+        ("solves_ranges", "i8"),
+        ("heading_lines_body", "f8", (SOURCES, 3)),
+        ("baro_arm_body", "f8", (3,)),
+        ("mag_to_imu", "f8", (3, 3)),
+        ("mag_strength_tolerance", "f8"),
+        ("mag_inclination_tolerance", "f8"),
+        ("mag_error_distance", "f8"),
+        ("is_orientation_magnetic", "i8"),
+        ("gnss_covariance_scale", "f8"),
+        ("correlated_share", "f8"),
+        ("zupt_velocity_std", "f8"),
+        ("zupt_rate_std", "f8"),
+        ("body_velocity_arm_body", "f8", (3,)),
+        ("body_velocity_axes_body", "f8", (3, 3)),
+        ("wheel_arm_body", "f8", (3,)),
+        ("wheel_slip", "f8"),
+        ("nhc_arm_body", "f8", (3,)),
+        ("nhc_lateral_std", "f8"),
+        ("nhc_vertical_std", "f8"),
+        ("nhc_angle_std", "f8"),
+        ("nhc_slip", "f8"),
+        # Ranges: lowest elevation (rad), factor on variances, floors (m, m/s), what lasts in their errors (m).
+        ("elevation_mask", "f8"),
+        ("range_covariance_scale", "f8"),
+        ("code_std_floor", "f8"),
+        ("range_rate_std_floor", "f8"),
+        ("range_error_std", "f8", (3,)),
+        ("gate", "f8", (len(Stream), 4)),
+        ("reach", "i8", (len(Stream),)),
+        ("constrains", "i8", (len(Stream),)),
+        ("static_duration", "f8"),
+        ("moving_start_after", "f8"),
+        ("still_gyro_std", "f8"),
+        ("still_accel_std", "f8"),
+        ("moving_tilt_std", "f8"),
+        ("initial_heading", "f8"),
+        ("initial_heading_std", "f8"),
+        ("use_course", "i8"),
+        ("found_heading_std", "f8"),
+        ("course_min_speed", "f8"),
+        ("course_std", "f8"),
+        ("good_heading_std", "f8"),
+        # Memory of an earlier run: biases, place and heading of base_link (see ``warm_start``).
+        ("has_memory", "i8"),
+        ("remembered_accel_bias", "f8", (3,)),
+        ("remembered_accel_bias_std", "f8"),
+        ("remembered_gyro_bias", "f8", (3,)),
+        ("remembered_gyro_bias_std", "f8"),
+        ("remembered_place_ecef", "f8", (3,)),
+        ("remembered_place_std", "f8"),
+        ("remembered_place_tolerance", "f8"),
+        ("remembered_forward_ecef", "f8", (3,)),
+        ("remembered_heading_std", "f8"),
+        ("output_interval", "i8"),
+        *((f"{name}_at", "i8") for name in OPTIONAL_SIZES),
+        ("optional_std", "f8", (OPTIONAL_CAPACITY,)),
+        ("optional_noise_density", "f8", (OPTIONAL_CAPACITY,)),
+        ("optional_decay", "f8", (OPTIONAL_CAPACITY,)),
+    ],
+    align=True,
+)
+"""Parameters as the kernels use them: radians, body axes, gate thresholds by stream and degrees of freedom.
+
+``reach``: how many errors have to be in use for a measurement of a stream. ``constrains``: which constraints are
+switched on. ``NAME_at``: place of an optional error, or
+`NOWHERE`. ``optional_*``, from the first place behind the core: standard deviation at first, white noise that drives it
+(unit/rtHz), inverse correlation time (1/s).
+"""
+
+
+WORK = np.dtype(
+    [
+        ("half", "f8", (ACCEL_BIAS, ERROR_SIZE)),
+        ("turned", "f8", (ERROR_SIZE, ACCEL_BIAS)),
+        ("jacobian", "f8", (3, ERROR_CAPACITY)),
+        ("innovation", "f8", (3,)),
+        ("noise", "f8", (3, 3)),
+        ("effect", "f8", (3, 4)),
+        ("shared", "f8", (3, ERROR_CAPACITY)),
+        ("projected", "f8", (3, ERROR_CAPACITY)),
+        ("innovation_covariance", "f8", (3, 3)),
+        ("noise_seen", "f8", (3, 3)),
+        ("gain", "f8", (ERROR_CAPACITY, 3)),
+        ("residual_gain", "f8", (ERROR_CAPACITY, 3)),
+        ("correction", "f8", (ERROR_CAPACITY,)),
+        # The signals of one epoch, and their least squares (see ``ranges``).
+        ("signal_count", "i8"),
+        ("signal_index", "i8", (LARGEST_EPOCH,)),
+        ("signal_innovation", "f8", (LARGEST_EPOCH,)),
+        ("signal_spread", "f8", (LARGEST_EPOCH,)),
+        ("signal_noise", "f8", (LARGEST_EPOCH,)),
+        ("signal_direction", "f8", (LARGEST_EPOCH, 3)),
+        ("signal_weight", "f8", (LARGEST_EPOCH,)),
+        ("signal_residual", "f8", (LARGEST_EPOCH,)),
+        ("signal_square", "f8", (LARGEST_EPOCH,)),
+        ("sorted", "f8", (LARGEST_EPOCH,)),
+        ("normal", "f8", (4, 4)),
+        ("right", "f8", (4,)),
+        ("step", "f8", (4,)),
+    ],
+    align=True,
+)
+"""Scratch memory of the kernels: nothing is allocated per sample.
+
+``shared``: covariance of the noise of a measurement with the errors, zero but where an aid says otherwise.
+"""
+
+
+_NEVER = {
+    "imu": ("stamp",),
+    "window": (
+        "start",
+        "still_stamp",
+        "motion_stamp",
+        "last_fix_stamp",
+        "anchor_stamp",
+    ),
+    "recovery": (
+        "absolute_stamp",
+        "reset_stamp",
+    ),
+    "mag": ("disturbed_stamp",),
+    "heading": ("given_stamp",),
+    "rest": (
+        "block_end",
+        "moving_stamp",
+        "resting_stamp",
+        "quiet_fix_stamp",
+        "quiet_pressure_stamp",
+        "wheel_stamp",
+        "slip_stamp",
+    ),
+    "streams": (
+        "last_stamp",
+        "fused_stamp",
+        "fused_since",
+    ),
+    "tracker": ("stamp",),
+    "receiver": (
+        "fault_stamp",
+        "departure_stamp",
+        "seen_stamp",
+        "heading_mark_stamp",
+    ),
+}
+"""Stamps, by room, of what has not happened before the first sample."""
+
+
+def blank_state() -> np.ndarray:
+    """Return the state before the first IMU sample."""
+    state = allocate(STATE)
+    state["stamp"] = state["first_stamp"] = NEVER
+    for room, fields in _NEVER.items():
+        for field in fields:
+            state[room][field] = NEVER
+    state["tracker"]["scatter"] = state["tracker"]["scatter_paid"] = 1.0
+    state["attitude"][0, 0] = 1.0
+    state["levelling"]["kept_gyro_variance"] = np.inf
+    state["error_size"] = ERROR_SIZE
+    # Until there are two samples: longer than any gap, so that the first interval takes no bend from an earlier one.
+    state["imu"]["interval"] = 1e9
+    return state
