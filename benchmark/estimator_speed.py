@@ -13,7 +13,7 @@ from eskf_ros.compiled import COMPILED
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.gnss.ephemeris import EPHEMERIS, Ephemerides
 from eskf_ros.gnss.measurements import measured_epoch
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.range_receiver import RangeReceiver
 from eskf_ros.simulate.scenario import Recording, simulate
 

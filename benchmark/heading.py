@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.scenario import simulate
 
 

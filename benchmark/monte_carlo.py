@@ -23,7 +23,8 @@ from eskf_ros.filter.history.records import RECORD
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import STREAM_NAMES, Stream, Verdict
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, VELOCITY
-from eskf_ros.parameters import Parameters, from_mapping
+from eskf_ros.parameters.mapping import from_mapping
+from eskf_ros.parameters.tree import Parameters
 from eskf_ros.simulate.imu import ImuMount
 from eskf_ros.simulate.scenario import Recording, simulate
 

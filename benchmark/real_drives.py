@@ -8,6 +8,8 @@ where they come from). `--keep` leaves the recordings, parameter files and last 
 
 from __future__ import annotations
 
+from eskf_ros.parameters.ros_yaml import load
+
 import argparse
 import math
 import sys
@@ -27,7 +29,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from eskf_ros import parameters
 from eskf_ros.bags import open_bag
 from eskf_ros.geodesy import earth
 from eskf_ros.geodesy.map_frame import MapFrame
@@ -412,7 +413,7 @@ def replay_with_outages(recording: Recording, variant: Variant, outages: Outages
     first = int(read(recording.bag, "/imu/data", IMU)["stamp"][0])
     truth = truth[(truth["stamp"] >= estimate["stamp"][0]) & (truth["stamp"] <= estimate["stamp"][-1])]
 
-    lever_arm = parameters.load(recording.config(variant.lines, variant.chosen_noise)).gnss.lever_arm
+    lever_arm = load(recording.config(variant.lines, variant.chosen_noise)).gnss.lever_arm
     antenna = estimate["position"] + Rotation.from_quat(estimate["orientation"]).apply(lever_arm)
     datum = MapFrame(tuple(summary["datum"]))
     truth_ecef = np.array(

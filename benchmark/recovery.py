@@ -22,7 +22,7 @@ from monte_carlo import NO_SIDE_SLIP, Array, Run, feed, nees, run, state_error
 
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.error_state import POSITION
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.episodes import Episode, Outage
 from eskf_ros.simulate.gnss_episodes import BadFixes, ClaimedStd, Multipath, Spoofing, ZeroCovariance
 from eskf_ros.simulate.scenario import simulate

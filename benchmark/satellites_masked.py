@@ -32,7 +32,7 @@ from eskf_ros.gnss.measurements import Masks, measured_epoch
 from eskf_ros.gnss.point_solution import SolutionStatus, solve
 from eskf_ros.gnss.ranges import locate
 from eskf_ros.gnss.signals import Gnss
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.range_receiver import RangeReceiver
 from eskf_ros.simulate.scenario import simulate
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from eskf_ros.bags import open_bag
 from eskf_ros.geodesy import earth
-from eskf_ros.parameters import load
+from eskf_ros.parameters.ros_yaml import load
 from eskf_ros.replay.run import Options, replay
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -17,7 +17,7 @@ from monte_carlo import run
 from numpy.typing import NDArray
 
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.recording import Recording
 from eskf_ros.simulate.scenario import simulate
 from eskf_ros.simulate.scenarios import TUNNEL_START

@@ -42,7 +42,9 @@ from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.output.global_odometry import ODOMETRY
 from eskf_ros.filter.state.enums import CONSTRAINTS, STREAM_NAMES, Status, Stream, Verdict
 from eskf_ros.geodesy.map_frame import MapFrame, to_geodetic
-from eskf_ros.parameters import Parameters, from_mapping, load
+from eskf_ros.parameters.mapping import from_mapping
+from eskf_ros.parameters.ros_yaml import load
+from eskf_ros.parameters.tree import Parameters
 from eskf_ros.replay.summary import CHI_SQUARE_95, counted, final_result, named
 
 __all__ = ["Filter", "Result", "run"]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import Stream
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.recording import Recording
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "benchmark"))

@@ -15,7 +15,7 @@ from eskf_ros.filter.inertial.navigation_frame import set_datum
 from eskf_ros.filter.loop import take_sample
 from eskf_ros.filter.settings import settings_from
 from eskf_ros.filter.state.time import NEVER
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 
 Array = NDArray[np.float64]
 

@@ -151,7 +151,7 @@ def simulate_ranges(
 
 def tight_navigator(recording: Recording, **changes: Any) -> Navigator:
     """Return a navigator in tight mode that knows the sensors of a recording."""
-    from eskf_ros.parameters import from_mapping
+    from eskf_ros.parameters.mapping import from_mapping
 
     named = {key.replace("__", "."): value for key, value in changes.items()}
     mapping = {**recording.parameters(), "alignment.course_std_deg": 0.1, **PARAMETERS, **named}

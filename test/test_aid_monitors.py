@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.episodes import Outage
 from eskf_ros.simulate.gnss_episodes import CorrelatedErrors, Multipath, Overconfidence, Spoofing
 from eskf_ros.simulate.imu import grade_parameters

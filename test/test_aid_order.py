@@ -14,7 +14,7 @@ from monte_carlo import body_velocity_messages, wheel_messages
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import CONSTRAINTS, Stream, Verdict
 from eskf_ros.geodesy.magnetic_model import FieldUnknown, field_at
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.barometer import Barometer
 from eskf_ros.simulate.body_velocity import BodyVelocity
 from eskf_ros.simulate.dual_antenna import DualAntenna

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import eskf_ros
 from eskf_ros.bags import open_bag
-from eskf_ros.parameters import load
+from eskf_ros.parameters.ros_yaml import load
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 CONFIG = CHECKOUT / "config" / "tunnel_drive.yaml"

@@ -21,7 +21,7 @@ from eskf_ros.filter import fuse, layout, navigator, predict, settings
 from eskf_ros.filter.measurements import kalman_update
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, GYRO_BIAS
 from eskf_ros.geodesy.rotation import to_matrix
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.scenario import SCENARIOS, Recording, simulate
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "benchmark"))

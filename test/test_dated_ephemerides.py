@@ -19,7 +19,7 @@ from eskf_ros.gnss.ephemeris_cloud import write_ephemerides
 from eskf_ros.gnss.ranges import CODE_VALID, Status, allocate_ranges, locate
 from eskf_ros.gnss.time import normalized
 from eskf_ros.inputs.epochs import RangeIntake
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.range_receiver import RangeMeasurements, RangeReceiver
 from eskf_ros.simulate.scenario import Recording, simulate
 

@@ -20,7 +20,7 @@ from eskf_ros.filter.state import augmented_states
 from eskf_ros.filter.state.enums import Stream, Verdict
 from eskf_ros.filter.state.error_state import ERROR_SIZE, NOWHERE
 from eskf_ros.filter.state.time import NEVER
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.episodes import WheelSlip
 from eskf_ros.simulate.scenario import Recording, simulate
 from eskf_ros.simulate.scenarios import TUNNEL_START

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from eskf_ros.filter.alignment.heading_search import begin_search, note_level, predict_search, turn_found, update_search
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import Status
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.scenario import Recording, simulate
 
 DT = 0.01

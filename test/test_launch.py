@@ -15,7 +15,7 @@ import pytest
 from ros_process import Process, Ros
 
 from eskf_ros.filter.navigator import compile_kernels
-from eskf_ros.parameters import leaves
+from eskf_ros.parameters.mapping import leaves
 from eskf_ros.replay.main import main as replay
 
 ROOT = Path(__file__).resolve().parents[1]

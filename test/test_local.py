@@ -10,7 +10,7 @@ import pytest
 from eskf_ros.filter.alignment.heading_search import COSINE as SEARCH_COSINE
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import Status, Stream
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.scenario import Recording, simulate
 
 SECOND = 1_000_000_000

@@ -23,7 +23,8 @@ from eskf_ros.gnss.measurements import MEASURED_SIGNAL
 from eskf_ros.gnss.ranges import CODE_VALID
 from eskf_ros.gnss.ranges import Status as RangeStatus
 from eskf_ros.gnss.signals import Gnss
-from eskf_ros.parameters import Parameters, from_mapping
+from eskf_ros.parameters.mapping import from_mapping
+from eskf_ros.parameters.tree import Parameters
 from eskf_ros.simulate.scenario import Recording, simulate
 
 SECOND = 1_000_000_000

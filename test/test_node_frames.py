@@ -14,7 +14,8 @@ from ros_process import needs_ros
 from scipy.spatial.transform import Rotation
 
 from eskf_ros.filter.output.global_odometry import ODOMETRY
-from eskf_ros.parameters import Parameters, from_mapping
+from eskf_ros.parameters.mapping import from_mapping
+from eskf_ros.parameters.tree import Parameters
 from eskf_ros.ros_node.extrinsics import ANTENNA, IMU, Extrinsics, matrix_of, roll_pitch_yaw_deg
 from eskf_ros.ros_node.transforms import Track, TransformWatch, map_to_odom, yaw_of
 from eskf_ros.ros_node.two_d import PLANAR, flatten

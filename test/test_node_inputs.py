@@ -17,7 +17,9 @@ from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, SATELLITE_KNOWN, all
 from eskf_ros.gnss.ranges import Status as RangeStatus
 from eskf_ros.inputs.epochs import RangeIntake
 from eskf_ros.inputs.table import FIXES, INPUTS, RANGES
-from eskf_ros.parameters import Leaf, ParameterError, Parameters, from_mapping, leaves
+from eskf_ros.parameters.mapping import Leaf, from_mapping, leaves
+from eskf_ros.parameters.schema import ParameterError
+from eskf_ros.parameters.tree import Parameters
 
 SECOND = 1_000_000_000
 STAMP = 1_700_000_000_123_456_789

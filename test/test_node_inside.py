@@ -16,7 +16,7 @@ from eskf_ros.bags import StringTable, decode, encode
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import Status, Stream
 from eskf_ros.geodesy.map_frame import MapFrame
-from eskf_ros.parameters import load
+from eskf_ros.parameters.ros_yaml import load
 from eskf_ros.ros_node.error_counter import FRESH, KINDS, Trouble
 
 SECOND = 1_000_000_000

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from eskf_ros.filter.alignment.warm_start import Memory
 from eskf_ros.geodesy.map_frame import MapFrame
-from eskf_ros.parameters import load
+from eskf_ros.parameters.ros_yaml import load
 from eskf_ros.ros_node.memory import read_memory, write_memory
 from eskf_ros.simulate.scenario import simulate
 

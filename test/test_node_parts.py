@@ -26,7 +26,10 @@ import eskf_ros
 from eskf_ros.compiled import COMPILED, _sources_digest, sentence_on_compiling
 from eskf_ros.filter.output.global_odometry import ODOMETRY
 from eskf_ros.filter.state.memory import allocate
-from eskf_ros.parameters import ParameterError, Parameters, leaves, to_mapping, to_yaml
+from eskf_ros.parameters.docs import to_yaml
+from eskf_ros.parameters.mapping import leaves, to_mapping
+from eskf_ros.parameters.schema import ParameterError
+from eskf_ros.parameters.tree import Parameters
 from eskf_ros.ros_node.cdr import ImuReader, LayoutError, OdometryMessageWriter, OdometryWriter, imu_from_message
 from eskf_ros.ros_node.clocks import Stamp, StampMonitor, clock_complaints
 from eskf_ros.ros_node.odometry import fill_odometry

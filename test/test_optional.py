@@ -25,7 +25,7 @@ from eskf_ros.filter.state import augmented_states
 from eskf_ros.filter.state.enums import Stream, Verdict
 from eskf_ros.filter.state.error_state import ERROR_SIZE, NOWHERE
 from eskf_ros.filter.state.memory import allocate
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.scenario import Recording, simulate
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "benchmark"))

@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
+from eskf_ros.parameters.docs import to_markdown
+from eskf_ros.parameters.docs import to_yaml
+from eskf_ros.parameters.mapping import from_mapping
+from eskf_ros.parameters.mapping import leaves
+from eskf_ros.parameters.mapping import to_mapping
+from eskf_ros.parameters.ros_yaml import load
+
 import dataclasses
 import math
 import subprocess
@@ -12,11 +19,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from eskf_ros import parameters as tree
-from eskf_ros.parameters import Leaf, ParameterError, Parameters, Value
+from eskf_ros.parameters.mapping import Leaf
+from eskf_ros.parameters.schema import ParameterError, Value
+from eskf_ros.parameters.tree import Parameters
 
 CHECKOUT = Path(__file__).resolve().parent.parent
-LEAVES = {leaf.name: leaf for leaf in tree.leaves()}
+LEAVES = {leaf.name: leaf for leaf in leaves()}
 
 
 def write(folder: Path, text: str) -> Path:
@@ -27,7 +35,7 @@ def write(folder: Path, text: str) -> Path:
 
 def problems_of(mapping: dict[str, object]) -> tuple[str, ...]:
     with pytest.raises(ParameterError) as caught:
-        tree.from_mapping(mapping)
+        from_mapping(mapping)
     return caught.value.problems
 
 
@@ -35,35 +43,35 @@ def problems_of(mapping: dict[str, object]) -> tuple[str, ...]:
 
 
 def test_config_file_is_written_from_the_tree() -> None:
-    assert (CHECKOUT / "config" / "eskf.yaml").read_text(encoding="utf-8") == tree.to_yaml(), (
+    assert (CHECKOUT / "config" / "eskf.yaml").read_text(encoding="utf-8") == to_yaml(), (
         "run python -m eskf_ros.parameters"
     )
 
 
 def test_reference_is_written_from_the_tree() -> None:
-    assert (CHECKOUT / "docs" / "parameters.md").read_text(encoding="utf-8") == tree.to_markdown(), (
+    assert (CHECKOUT / "docs" / "parameters.md").read_text(encoding="utf-8") == to_markdown(), (
         "run python -m eskf_ros.parameters"
     )
 
 
 def test_config_file_holds_the_defaults() -> None:
-    assert tree.to_mapping(tree.load(CHECKOUT / "config" / "eskf.yaml")) == tree.to_mapping(Parameters())
+    assert to_mapping(load(CHECKOUT / "config" / "eskf.yaml")) == to_mapping(Parameters())
 
 
 @pytest.mark.parametrize("path", sorted((CHECKOUT / "config").glob("*.yaml")), ids=lambda path: path.name)
 def test_every_shipped_config_can_be_read(path: Path) -> None:
-    tree.load(path)
+    load(path)
 
 
-@pytest.mark.parametrize("leaf", tree.leaves(), ids=lambda leaf: leaf.name)
+@pytest.mark.parametrize("leaf", leaves(), ids=lambda leaf: leaf.name)
 def test_every_parameter_is_explained_and_its_default_is_allowed(leaf: Leaf) -> None:
     assert leaf.convert(leaf.default) == leaf.default or math.isnan(leaf.default)  # type: ignore[arg-type]
     assert leaf.rule.description.endswith((".", ")"))
     for words, unit in (("_deg", "deg"), ("_m_s", "m/s")):
         if leaf.name.endswith(words):
             assert leaf.rule.unit == unit
-    shown = tree.to_yaml() + tree.to_markdown()
-    assert leaf.name in tree.to_markdown()
+    shown = to_yaml() + to_markdown()
+    assert leaf.name in to_markdown()
     assert leaf.rule.unit in shown
 
 
@@ -125,22 +133,22 @@ def values_of(leaf: Leaf) -> st.SearchStrategy[Value]:
 
 @st.composite
 def parameter_sets(draw: st.DrawFn) -> Parameters:
-    changed = draw(st.lists(st.sampled_from(tree.leaves()), unique_by=lambda leaf: leaf.name, max_size=12))
-    return tree.from_mapping({leaf.name: draw(values_of(leaf)) for leaf in changed})
+    changed = draw(st.lists(st.sampled_from(leaves()), unique_by=lambda leaf: leaf.name, max_size=12))
+    return from_mapping({leaf.name: draw(values_of(leaf)) for leaf in changed})
 
 
 @settings(max_examples=40)
 @given(parameter_sets())
 def test_written_file_reads_back_the_same(tmp_path_factory: pytest.TempPathFactory, parameters: Parameters) -> None:
-    path = write(tmp_path_factory.getbasetemp(), tree.to_yaml(parameters))
-    assert tree.to_mapping(tree.load(path)) == tree.to_mapping(parameters)
+    path = write(tmp_path_factory.getbasetemp(), to_yaml(parameters))
+    assert to_mapping(load(path)) == to_mapping(parameters)
 
 
 @given(parameter_sets())
 def test_mapping_reads_back_the_same(parameters: Parameters) -> None:
-    mapping = tree.to_mapping(parameters)
+    mapping = to_mapping(parameters)
     assert list(mapping) == list(LEAVES)
-    assert tree.to_mapping(tree.from_mapping(mapping)) == mapping
+    assert to_mapping(from_mapping(mapping)) == mapping
 
 
 # ------------------------------------------------------------------------------------------------------------ errors
@@ -195,7 +203,7 @@ def test_all_mistakes_are_reported_together_each_with_the_file(tmp_path: Path) -
         tmp_path, "/**:\n  ros__parameters:\n    gnss: {gate_probability: 2.0, lever: 1}\n    histroy.window: 3\n"
     )
     with pytest.raises(ParameterError) as caught:
-        tree.load(path)
+        load(path)
     lines = str(caught.value).splitlines()
     assert len(lines) == len(caught.value.problems) == 3
     assert all(line.startswith(f"{path}: ") for line in lines)
@@ -204,7 +212,7 @@ def test_all_mistakes_are_reported_together_each_with_the_file(tmp_path: Path) -
 
 
 def test_bounds_themselves() -> None:
-    values = tree.from_mapping({"imu.accel_bias_std": 0, "history.window": 60, "alignment.initial_heading_deg": -360})
+    values = from_mapping({"imu.accel_bias_std": 0, "history.window": 60, "alignment.initial_heading_deg": -360})
     assert (values.imu.accel_bias_std, values.history.window) == (0.0, 60.0)
     assert isinstance(values.imu.accel_bias_std, float)
 
@@ -212,7 +220,7 @@ def test_bounds_themselves() -> None:
 def test_numpy_lists_are_accepted() -> None:
     import numpy as np
 
-    values = tree.from_mapping({"gnss.lever_arm": np.array([0.5, 0.0, 1.0])})
+    values = from_mapping({"gnss.lever_arm": np.array([0.5, 0.0, 1.0])})
     assert values.gnss.lever_arm == (0.5, 0.0, 1.0)
     assert all(type(number) is float for number in values.gnss.lever_arm)
 
@@ -243,19 +251,19 @@ LEVER_ARM = (0.8, -0.2, 1.4)
     ],
 )
 def test_dialects_of_ros(tmp_path: Path, text: str) -> None:
-    assert tree.load(write(tmp_path, text)).gnss.lever_arm == LEVER_ARM
+    assert load(write(tmp_path, text)).gnss.lever_arm == LEVER_ARM
 
 
 @pytest.mark.parametrize("text", ["1e-3", "1.0e-3", "1E-03", ".1e-2", "1.e-3", "0.001", "+1e-3"])
 def test_numbers_with_exponents(tmp_path: Path, text: str) -> None:
     path = write(tmp_path, f"/**:\n  ros__parameters:\n    imu.gyro_noise_density: {text}\n")
-    assert tree.load(path).imu.gyro_noise_density == 1e-3
+    assert load(path).imu.gyro_noise_density == 1e-3
 
 
 def test_quoted_number_is_a_string(tmp_path: Path) -> None:
     path = write(tmp_path, "/**:\n  ros__parameters:\n    imu.gyro_noise_density: '1e-3'\n")
     with pytest.raises(ParameterError, match=r"imu.gyro_noise_density: '1e-3' is not allowed here"):
-        tree.load(path)
+        load(path)
 
 
 def test_later_section_wins_and_the_rest_stays(tmp_path: Path) -> None:
@@ -264,7 +272,7 @@ def test_later_section_wins_and_the_rest_stays(tmp_path: Path) -> None:
         "/**:\n  ros__parameters:\n    history.window: 1.0\n    gnss.time_offset: -0.1\n"
         "eskf_node:\n  ros__parameters:\n    history:\n      window: 3.0\n",
     )
-    values = tree.load(path)
+    values = load(path)
     assert (values.history.window, values.gnss.time_offset) == (3.0, -0.1)
 
 
@@ -277,7 +285,7 @@ def test_full_node_name_takes_exactly_its_sections(tmp_path: Path) -> None:
         ),
     )
     windows = {
-        name: tree.load(path, name).history.window
+        name: load(path, name).history.window
         for name in ("/left/eskf_node", "/right/eskf_node", "/eskf_node", "/a/b/c/eskf_node", "/b/c/eskf_node")
     }
     assert list(windows.values()) == [2.0, 3.0, 4.0, 5.0, 1.0]
@@ -308,7 +316,7 @@ def test_ros_reads_the_written_file_as_we_do() -> None:
     values = read_by_ros(CHECKOUT / "config" / "eskf.yaml", "/")
     # Empty lists stay out of the file: ROS cannot declare a list without elements.
     assert set(LEAVES) - set(values) == {"datum", "mag.mount_rpy_deg"}
-    assert tree.to_mapping(tree.from_mapping(values)) == tree.to_mapping(Parameters())
+    assert to_mapping(from_mapping(values)) == to_mapping(Parameters())
 
 
 @pytest.mark.parametrize("namespace", ["/", "/robot", "/robot/front"])
@@ -335,9 +343,9 @@ def test_sections_apply_as_in_ros(tmp_path: Path, sections: tuple[str, str], nam
     if from_ros is None:
         # ROS silently takes the defaults here; whoever names a file wants it used, so for us this is an error.
         with pytest.raises(ParameterError, match=f"no section applies to node {node_name}"):
-            tree.load(path, node_name)
+            load(path, node_name)
     else:
-        assert tree.load(path, node_name).history.window == from_ros
+        assert load(path, node_name).history.window == from_ros
 
 
 @pytest.mark.parametrize(
@@ -370,7 +378,7 @@ def test_sections_apply_as_in_ros(tmp_path: Path, sections: tuple[str, str], nam
 def test_file_that_cannot_be_used(tmp_path: Path, text: str, said: str) -> None:
     path = write(tmp_path, text)
     with pytest.raises(ParameterError) as caught:
-        tree.load(path)
+        load(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -378,10 +386,10 @@ def test_file_that_cannot_be_used(tmp_path: Path, text: str, said: str) -> None:
 
 def test_missing_binary_and_folder(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match=r"absent\.yaml: cannot read the parameter file: No such file"):
-        tree.load(tmp_path / "absent.yaml")
+        load(tmp_path / "absent.yaml")
     with pytest.raises(ParameterError, match="cannot read the parameter file: Is a directory"):
-        tree.load(tmp_path)
+        load(tmp_path)
     binary = tmp_path / "bag.mcap"
     binary.write_bytes(b"\x89MCAP0\r\n\xff\xfe")
     with pytest.raises(ParameterError, match=r"bag\.mcap: not a text file"):
-        tree.load(binary)
+        load(binary)

@@ -12,7 +12,7 @@ import pytest
 
 from eskf_ros.compiled import COMPILED
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.scenario import simulate
 
 CHECKOUT = Path(__file__).resolve().parent.parent
@@ -95,7 +95,7 @@ def test_nothing_is_left_to_compile_once_the_kernels_are() -> None:
     code = """
 import numba, numpy as np
 from eskf_ros.filter import navigator
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.scenario import simulate
 
 navigator.compile_kernels()

@@ -20,7 +20,7 @@ from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, SATELLITE_KNOWN, all
 from eskf_ros.gnss.ranges import Status as RangeStatus
 from eskf_ros.gnss.signals import Gnss
 from eskf_ros.inputs.epochs import DEFAULT_KLOBUCHAR, RECENT, RangeIntake
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 
 SECOND = 1_000_000_000
 STAMP = 1_700_000_000_123_456_789

@@ -24,7 +24,7 @@ from eskf_ros.filter.tight.epoch import MILLISECOND
 from eskf_ros.gnss.ranges import DOPPLER_VALID
 from eskf_ros.gnss.ranges import Status as RangeStatus
 from eskf_ros.gnss.signals import Gnss
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.scenario import Recording, simulate
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "benchmark"))

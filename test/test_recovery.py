@@ -14,7 +14,7 @@ import pytest
 
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import Phase, Status, Stream, Verdict
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.episodes import Episode, Outage
 from eskf_ros.simulate.gnss_episodes import Multipath, Spoofing
 from eskf_ros.simulate.scenario import Recording, simulate

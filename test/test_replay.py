@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from eskf_ros.parameters.docs import to_yaml
+from eskf_ros.parameters.mapping import from_mapping
+from eskf_ros.parameters.mapping import to_mapping
+from eskf_ros.parameters.ros_yaml import load
+
 import csv
 import json
 import math
@@ -22,7 +27,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import chi2
 
-from eskf_ros import parameters
 from eskf_ros.bags import BagWriter, open_bag
 from eskf_ros.compiled import COMPILED
 from eskf_ros.filter.navigator import Navigator
@@ -109,7 +113,7 @@ def in_outage(stamps: Any, first_stamp: int) -> Any:
 @pytest.fixture(scope="module")
 def reference(recording: Any) -> tuple[Navigator, NDArray[Any], NDArray[Any]]:
     """The navigator fed one message after the other in recorded order; its rows at 50 Hz and its records."""
-    navigator = Navigator(parameters.load(CONFIG), output_rate=50.0)
+    navigator = Navigator(load(CONFIG), output_rate=50.0)
     times, messages, first_stamp = {}, {}, int(recording["imu/data"][1]["stamp"][0])
     for topic in ("gps/fix", "gps/vel", "imu/data"):
         times[topic], messages[topic] = recording[topic]
@@ -388,8 +392,8 @@ def test_truth_as_fixes_of_the_antenna_and_in_the_map(tmp_path: Path, recording:
             writer.write(writer.add_topic(topic, TYPES[topic]), *recording[topic], ["sensor"] * 4)
         writer.write(writer.add_topic("truth/fix", TYPES["gps/fix"]), log_time, fixes, ["gps"])
         writer.write(writer.add_topic("truth/map", TYPES["truth"]), log_time, in_map, ["", "map"] + ["base_link"] * 3)
-    configured = parameters.to_mapping(parameters.load(CONFIG)) | {"datum": datum}
-    config.write_text(parameters.to_yaml(parameters.from_mapping(configured)))
+    configured = to_mapping(load(CONFIG)) | {"datum": datum}
+    config.write_text(to_yaml(from_mapping(configured)))
     outage = ["--outage", f"{OUTAGE[0]}:{OUTAGE[1]}", "--config", str(config)]
     by_fix = run(tmp_path / "fix", "--truth", "truth/fix", *outage, bag=bag).summary
     by_map = run(tmp_path / "map", "--truth", "truth/map", *outage, bag=bag).summary

@@ -16,7 +16,7 @@ from eskf_ros.filter.measurements import body_velocity, zaru, zupt
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import CONSTRAINT_INTERVAL, Stream, Verdict
 from eskf_ros.filter.state.error_state import GYRO_BIAS
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.body_velocity import BodyVelocity
 from eskf_ros.simulate.episodes import Outage
 from eskf_ros.simulate.scenario import simulate

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from eskf_ros.bags.writer import BagWriter
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import Stream, Verdict
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.replay.main import main as replay
 from eskf_ros.simulate.frames import STRINGS
 from eskf_ros.simulate.gnss import GnssReceiver

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from eskf_ros.parameters.mapping import from_mapping
+from eskf_ros.parameters.ros_yaml import load
+
 import dataclasses
 import math
 from pathlib import Path
@@ -14,7 +17,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from simulated import FRAME, TOPICS, antenna_errors, assert_chi_square, assert_imu_integrates_back, read, seconds
 
-from eskf_ros import parameters
 from eskf_ros.simulate import main as command
 from eskf_ros.simulate.imu import GRADES, ImuMount, SensorErrors, grade_parameters, ideal_interval_means, ideal_samples
 from eskf_ros.simulate.scenario import (
@@ -115,7 +117,7 @@ def test_scale_factor_and_quantisation_only_when_asked_for() -> None:
 
 def test_grades_are_parameters_of_the_estimator() -> None:
     recording = simulate("drive", stop=5.0, grade="consumer")
-    tree = parameters.from_mapping(recording.parameters())
+    tree = from_mapping(recording.parameters())
     assert tree.imu.gyro_noise_density == GRADES["consumer"]["imu.gyro_noise_density"]
     assert tuple(tree.gnss.lever_arm) == LEVER_ARM
     for name, value in GRADES["tactical"].items():
@@ -330,8 +332,8 @@ def test_bundled_recording_is_what_the_command_makes(tmp_path: Path) -> None:
 
 
 def test_configuration_of_the_bundled_recording_describes_its_sensors() -> None:
-    tree = parameters.load(CHECKOUT / "config" / "tunnel_drive.yaml")
-    truth = parameters.from_mapping({k: v for k, v in simulate("tunnel_drive").parameters().items() if k != "datum"})
+    tree = load(CHECKOUT / "config" / "tunnel_drive.yaml")
+    truth = from_mapping({k: v for k, v in simulate("tunnel_drive").parameters().items() if k != "datum"})
     assert dataclasses.asdict(tree.imu) == dataclasses.asdict(truth.imu)
     assert dataclasses.asdict(tree.gnss) == dataclasses.asdict(truth.gnss)
 

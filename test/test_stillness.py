@@ -19,7 +19,7 @@ from eskf_ros.filter.state.enums import CONSTRAINT_INTERVAL, Stream, Verdict
 from eskf_ros.filter.state.memory import allocate
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity.detector import learn_from_block, update_rest_evidence
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.imu import vibration
 from eskf_ros.simulate.scenario import SCENARIOS, Recording, simulate
 from eskf_ros.simulate.scenarios import PARKED, TUNNEL_START

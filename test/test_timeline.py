@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import Status, Verdict
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.scenario import Recording, simulate
 
 SECOND = 1_000_000_000

@@ -15,7 +15,7 @@ from eskf_ros.filter.alignment.warm_start import Memory
 from eskf_ros.filter.history.records import RECORD
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import Status, Verdict
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.ros_node.memory import read_memory, write_memory
 from eskf_ros.simulate.scenario import Recording, simulate
 

@@ -11,7 +11,7 @@ import pytest
 from aided import Run, run
 
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.parameters import from_mapping
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.recording import Recording
 from eskf_ros.simulate.scenario import simulate
 from eskf_ros.simulate.wheel import WheelOdometer

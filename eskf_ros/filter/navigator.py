@@ -49,7 +49,7 @@ from eskf_ros.gnss.range_model import NO_KLOBUCHAR
 from eskf_ros.gnss.ranges import Status as RangeStatus
 from eskf_ros.gnss.ranges import status_counts
 from eskf_ros.gnss.time import SECONDS_PER_WEEK, Instant
-from eskf_ros.parameters import Parameters
+from eskf_ros.parameters.tree import Parameters
 
 FloatArray = npt.NDArray[np.float64]
 StampArray = npt.NDArray[np.int64]

@@ -17,7 +17,8 @@ from eskf_ros.filter.state.memory import allocate
 from eskf_ros.filter.state.time import SECOND
 from eskf_ros.geodesy.rotation import from_roll_pitch_yaw, to_matrix
 from eskf_ros.gnss.signals import Gnss
-from eskf_ros.parameters import Aid, Parameters
+from eskf_ros.parameters.schema import Aid
+from eskf_ros.parameters.tree import Parameters
 
 Axes = tuple[float, float, float]
 FloatArray = npt.NDArray[np.float64]

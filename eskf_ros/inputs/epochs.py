@@ -34,7 +34,7 @@ from eskf_ros.gnss.ranges import (
 )
 from eskf_ros.gnss.signals import Gnss
 from eskf_ros.gnss.time import Instant
-from eskf_ros.parameters import Parameters
+from eskf_ros.parameters.tree import Parameters
 
 HORIZON = math.radians(-90.0)
 """No elevation mask: where the receiver is, only the filter knows."""

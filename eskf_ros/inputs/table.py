@@ -26,7 +26,7 @@ from eskf_ros.bags import POINT_CLOUD, Batch
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.inputs.epochs import RangeIntake
-from eskf_ros.parameters import Parameters
+from eskf_ros.parameters.tree import Parameters
 
 Arguments = Iterable[tuple[Any, ...]]
 Converter = Callable[[Batch], Arguments]

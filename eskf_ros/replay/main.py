@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from rich.table import Table
 
-    from eskf_ros.parameters import Parameters
+    from eskf_ros.parameters.tree import Parameters
 
 _EPILOG = """\
 results, in DIR/<bag name>_eskf/ (files of an earlier replay are replaced):
@@ -188,7 +188,6 @@ def _say(text: str) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from eskf_ros import parameters as parameter_tree
 
     folders = [_folder(bag, options.out) for bag in options.bags]
     for folder in folders:
@@ -197,8 +196,8 @@ def _run(options: argparse.Namespace) -> int:
                 f"two of the recordings would write to {folder}; replay them one by one with different --out"
             )
     try:
-        parameters = parameter_tree.load(options.config) if options.config else parameter_tree.Parameters()
-    except parameter_tree.ParameterError as error:
+        parameters = load(options.config) if options.config else Parameters()
+    except ParameterError as error:
         raise _Mistake("; ".join(str(error).splitlines())) from error
 
     summaries: list[dict[str, Any]] = []

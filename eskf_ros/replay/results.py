@@ -21,7 +21,7 @@ from eskf_ros.bags import BagWriter, message_dtype
 from eskf_ros.filter.state.enums import STREAM_NAMES, Stream, Verdict
 from eskf_ros.filter.tight.signal import name_of
 from eskf_ros.geodesy.map_frame import MapFrame, to_geodetic
-from eskf_ros.parameters import Frames
+from eskf_ros.parameters.tree import Frames
 from eskf_ros.replay.topics import FIX, ODOMETRY
 from eskf_ros.replay.tum_writer import tum_text
 

@@ -19,7 +19,7 @@ from eskf_ros.gnss.rinex import RinexError
 from eskf_ros.inputs.epochs import RangeIntake
 from eskf_ros.inputs.rinex_as_messages import RangesError, merged, read_beside
 from eskf_ros.inputs.table import FIX
-from eskf_ros.parameters import Parameters
+from eskf_ros.parameters.tree import Parameters
 from eskf_ros.replay.feed import Feed
 from eskf_ros.replay.results import ResultFiles, selected
 from eskf_ros.replay.summary import Summary, ranges_result, truth_result

@@ -33,7 +33,7 @@ from eskf_ros.filter.state.enums import STREAM_NAMES, Status, Stream, Verdict
 from eskf_ros.geodesy.map_frame import MapFrame, east_north_up_to_ecef, to_geodetic
 from eskf_ros.inputs.epochs import RangeIntake
 from eskf_ros.inputs.table import Input
-from eskf_ros.parameters import Parameters
+from eskf_ros.parameters.tree import Parameters
 from eskf_ros.replay.feed import Feed
 from eskf_ros.replay.topics import TopicNames
 from eskf_ros.replay.truth import rotation_matrices

@@ -8,7 +8,9 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from eskf_ros.parameters import Leaf, Parameters, Value, from_mapping, leaves, to_mapping
+from eskf_ros.parameters.mapping import Leaf, from_mapping, leaves, to_mapping
+from eskf_ros.parameters.schema import Value
+from eskf_ros.parameters.tree import Parameters
 
 
 def declare(node: Node, source: str = "") -> Parameters:

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from eskf_ros.parameters import Parameters, to_mapping
+from eskf_ros.parameters.mapping import to_mapping
+from eskf_ros.parameters.tree import Parameters
 
 Pose = tuple[np.ndarray, np.ndarray]
 """Position (3,) m and rotation matrix (3, 3) of a frame in another."""

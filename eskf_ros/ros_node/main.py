@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 2
-    from eskf_ros.parameters import ParameterError
+    from eskf_ros.parameters.schema import ParameterError
 
     try:
         run(_create, stop, arguments)
@@ -59,7 +59,7 @@ def _compile() -> int:
     if not COMPILED:
         print("eskf_node: numba is missing or switched off: there is nothing to compile", file=sys.stderr)
         return 2
-    from eskf_ros.parameters import Parameters
+    from eskf_ros.parameters.tree import Parameters
     from eskf_ros.ros_node.warm_up import compile_node
 
     with while_compiling(sentence_on_compiling(say)):

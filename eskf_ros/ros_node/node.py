@@ -27,7 +27,8 @@ from eskf_ros.filter.state.enums import STREAM_NAMES, Status, Stream, Verdict
 from eskf_ros.gnss.rinex import RinexError
 from eskf_ros.inputs.epochs import RangeIntake
 from eskf_ros.inputs.table import Input, uses_ranges
-from eskf_ros.parameters import ParameterError, Parameters
+from eskf_ros.parameters.schema import ParameterError
+from eskf_ros.parameters.tree import Parameters
 from eskf_ros.ros_node import robot_localization, transforms
 from eskf_ros.ros_node.cdr import ImuReader, ImuSample, imu_from_message
 from eskf_ros.ros_node.clocks import SECOND, Stamp, StampMonitor

@@ -11,7 +11,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from eskf_ros.parameters import Parameters
+from eskf_ros.parameters.tree import Parameters
 from eskf_ros.ros_node import transforms
 from eskf_ros.ros_node.cdr import AnyOdometryWriter, LayoutError, OdometryMessageWriter, OdometryWriter
 from eskf_ros.ros_node.odometry import GLOBAL, LOCAL, NUMBERS, fill_odometry

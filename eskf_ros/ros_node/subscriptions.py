@@ -11,7 +11,8 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from eskf_ros.bags import Batch, StringTable, decode
 from eskf_ros.inputs.table import Arguments, Input, inputs_of, time_offset_of
-from eskf_ros.parameters import ParameterError, Parameters
+from eskf_ros.parameters.schema import ParameterError
+from eskf_ros.parameters.tree import Parameters
 from eskf_ros.ros_node.clocks import SECOND, StampMonitor
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from eskf_ros.parameters import Frames
+from eskf_ros.parameters.tree import Frames
 
 try:
     from tf2_msgs.msg import TFMessage

@@ -9,7 +9,7 @@ from eskf_ros.filter.output.global_odometry import ODOMETRY
 from eskf_ros.filter.state.memory import allocate
 from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.inputs.epochs import compile_ranges
-from eskf_ros.parameters import Parameters
+from eskf_ros.parameters.tree import Parameters
 from eskf_ros.ros_node.odometry import NUMBERS, fill_odometry
 
 

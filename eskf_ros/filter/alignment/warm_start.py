@@ -14,7 +14,7 @@ import numpy as np
 from eskf_ros.compiled import njit
 from eskf_ros.geodesy.earth import EARTH_RATE, STANDARD_GRAVITY, east_north_up_to_ecef, geodetic_to_ecef
 from eskf_ros.geodesy.rotation import dot
-from eskf_ros.parameters import Parameters
+from eskf_ros.parameters.tree import Parameters
 
 SWITCHED_ON_SHARE = 0.1
 """Switching off and on, and another temperature, move a bias by this share of its standard deviation at start."""

@@ -1,0 +1,7 @@
+"""``python -m eskf_ros.parameters``: write the files that follow from the parameters."""
+
+import sys
+
+from eskf_ros.parameters.docs import main
+
+sys.exit(main())

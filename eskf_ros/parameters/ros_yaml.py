@@ -1,0 +1,89 @@
+"""The parameter files of ROS 2: sections by node names, wildcards, typed values."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from eskf_ros.parameters.mapping import _flat, from_mapping
+from eskf_ros.parameters.schema import ParameterError
+from eskf_ros.parameters.tree import Parameters
+
+
+class _RosLoader(yaml.SafeLoader):
+    """Reads `1e-3` as a number, as ROS and people do (in YAML 1.1 it is a string), and refuses repeated keys."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key_node, _ in node.value:
+            if key_node.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"{key_node.value} is given twice", key_node.start_mark
+                )
+            seen.add(key_node.value)
+        return super().construct_mapping(node, deep)
+
+
+def load(path: Path, node_name: str = "eskf_node") -> Parameters:
+    """Parameters from a ROS 2 parameter file.
+
+    Sections apply as in ROS: `/**`, `/*`, `eskf_node`, `/robot/eskf_node`, or nested namespaces; sections of other
+    nodes are ignored; where several apply, the later one in the file wins. A `node_name` without a leading slash
+    stands for the node in whatever single namespace the file uses.
+
+    Raises ParameterError (naming the file and everything wrong in it) for a file that cannot be read, is no YAML,
+    has no section for this node, or fails `from_mapping`.
+    """
+    source = str(path)
+    try:
+        document = yaml.load(path.read_text(encoding="utf-8"), Loader=_RosLoader)
+    except OSError as error:
+        raise ParameterError(source, [f"cannot read the parameter file: {error.strerror}"]) from error
+    except UnicodeDecodeError as error:
+        raise ParameterError(source, ["not a text file, so not a parameter file"]) from error
+    except yaml.YAMLError as error:
+        raise ParameterError(source, [f"not valid YAML: {' '.join(str(error).split())}"]) from error
+    wanted = "a ROS parameter file has '/**:', below it 'ros__parameters:', and below that the parameters"
+    if not isinstance(document, Mapping):
+        raise ParameterError(source, [f"no parameters found; {wanted}"])
+    sections = list(_sections(document, ""))
+    if not sections:
+        raise ParameterError(source, [f"no 'ros__parameters:' found; {wanted}"])
+    applying = [(name, content) for name, content in sections if _applies(name, node_name)]
+    if not applying:
+        names = ", ".join(name for name, _ in sections)
+        raise ParameterError(source, [f"no section applies to node {node_name}; the sections are {names}"])
+    concrete = sorted({name for name, _ in applying if "*" not in name})
+    if len(concrete) > 1:
+        raise ParameterError(
+            source, [f"sections for several nodes called {node_name}: {', '.join(concrete)}; keep one"]
+        )
+    merged: dict[str, object] = {}
+    for name, content in applying:
+        if not isinstance(content, Mapping):
+            raise ParameterError(source, [f"{name}: nothing below 'ros__parameters:'"])
+        merged.update(_flat(content, source))
+    return from_mapping(merged, source)
+
+
+def _sections(document: Mapping[str, object], namespace: str) -> Iterator[tuple[str, object]]:
+    for key, value in document.items():
+        if key == "ros__parameters":
+            yield namespace or "/", value
+        elif isinstance(value, Mapping):
+            yield from _sections(value, f"{namespace}/{str(key).strip('/')}")
+
+
+def _applies(section: str, node_name: str) -> bool:
+    pattern = re.escape(section).replace(r"/\*\*", r"(/\w+)*").replace(r"/\*", r"/\w+")
+    if node_name.startswith("/"):
+        return re.fullmatch(pattern, node_name) is not None
+    if "*" not in section:
+        return section.rpartition("/")[2] == node_name
+    # The namespace is not known here: a pattern applies when there is a namespace in which it would.
+    last = section.rpartition("/")[2]
+    return last in (node_name, "*", "**")
