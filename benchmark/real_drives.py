@@ -8,8 +8,6 @@ where they come from). `--keep` leaves the recordings, parameter files and last 
 
 from __future__ import annotations
 
-from eskf_ros.parameters.ros_yaml import load
-
 import argparse
 import math
 import sys
@@ -20,6 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+
+from eskf_ros.parameters.ros_yaml import load
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -78,7 +78,7 @@ def test_innovation_is_the_difference_of_heights(seed: int, far: float) -> None:
     height = geodetic_of(state)[2]
     assert baro.predict(state, 0, make_settings()) == pytest.approx(height, abs=1e-6)
     arm = body["imu_to_base"].T @ (np.array([1.5, -2.0, 0.7]) - [0.3, 0.1, -0.2])
-    np.testing.assert_allclose(SETTINGS["baro_arm_body"], arm, atol=1e-12)
+    np.testing.assert_allclose(SETTINGS["baro"]["arm_body"], arm, atol=1e-12)
     predicted = baro.predict(state, 0, SETTINGS)
     baro.linearize(state, payload(float(standard_pressure(np.array(predicted + 12.5)))), 0, SETTINGS, work)
     assert work["innovation"][0] == pytest.approx(12.5, abs=1e-6)

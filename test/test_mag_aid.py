@@ -137,7 +137,7 @@ def test_where_the_field_is_upright_it_tells_no_heading() -> None:
     state, payload = in_the_field(1, 0.0)
     up = np.array([0.0, 0.0, -50e-6])
     w, x, y, z = state["attitude"]
-    payload[:3] = np.array(SETTINGS["mag_to_imu"]).T @ Rotation.from_quat([x, y, z, w]).inv().apply(up)
+    payload[:3] = np.array(SETTINGS["mag"]["sensor_to_imu"]).T @ Rotation.from_quat([x, y, z, w]).inv().apply(up)
     payload[:3] += state["optional"][IRON - ERROR_SIZE : IRON - ERROR_SIZE + 3]
     assert mag.linearize(state, payload, SETTINGS, make_work()) == 0
 
@@ -151,7 +151,7 @@ def test_the_error_changes_with_the_way_and_keeps_its_variance(way: tuple[float,
     before = float(state["optional"][ERROR - ERROR_SIZE])
     state["position_map"][0] += way[0]
     mag.propagate_mag_error(state, math.remainder(3.1 + way[1], math.tau), SETTINGS)
-    length = way[0] / SETTINGS["mag_error_distance"] + way[1]
+    length = way[0] / SETTINGS["mag"]["error_distance"] + way[1]
     remaining = math.exp(-length) if length > 0.2 else 1.0
     assert state["optional"][ERROR - ERROR_SIZE] == pytest.approx(before * remaining)
     assert state["covariance"][ERROR, 0] == state["covariance"][0, ERROR] == pytest.approx(0.01 * remaining)

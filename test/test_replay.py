@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-from eskf_ros.parameters.docs import to_yaml
-from eskf_ros.parameters.mapping import from_mapping
-from eskf_ros.parameters.mapping import to_mapping
-from eskf_ros.parameters.ros_yaml import load
-
 import csv
 import json
 import math
@@ -31,6 +26,9 @@ from eskf_ros.bags import BagWriter, open_bag
 from eskf_ros.compiled import COMPILED
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import Status
+from eskf_ros.parameters.docs import to_yaml
+from eskf_ros.parameters.mapping import from_mapping, to_mapping
+from eskf_ros.parameters.ros_yaml import load
 from eskf_ros.replay.main import main
 from eskf_ros.replay.tum_writer import tum_text
 

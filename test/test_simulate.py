@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from eskf_ros.parameters.mapping import from_mapping
-from eskf_ros.parameters.ros_yaml import load
-
 import dataclasses
 import math
 from pathlib import Path
@@ -17,6 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from simulated import FRAME, TOPICS, antenna_errors, assert_chi_square, assert_imu_integrates_back, read, seconds
 
+from eskf_ros.parameters.mapping import from_mapping
+from eskf_ros.parameters.ros_yaml import load
 from eskf_ros.simulate import main as command
 from eskf_ros.simulate.imu import GRADES, ImuMount, SensorErrors, grade_parameters, ideal_interval_means, ideal_samples
 from eskf_ros.simulate.scenario import (

@@ -27,11 +27,26 @@ from eskf_ros.filter.measurements import (
     zupt,
 )
 from eskf_ros.filter.measurements.kalman_update import update
+from eskf_ros.filter.measurements.row import NEEDS_FIELD, NEEDS_HEADING, NEEDS_POSITION
 from eskf_ros.filter.output.local_odometry import note_jump
 from eskf_ros.filter.state.augmented_states import join
 from eskf_ros.filter.state.enums import SENSOR_STREAMS, Stream, Verdict
 from eskf_ros.filter.stationarity.detector import update_rest_evidence, watch_wheels
 from eskf_ros.filter.stationarity.static_window import update_evidence_from_fix, update_evidence_from_velocity
+
+MEASUREMENTS = (
+    gnss_position.ROW,
+    gnss_velocity.ROW,
+    heading.ROW,
+    mag.ROW,
+    wheel.ROW,
+    body_velocity.ROW,
+    baro.ROW,
+    zupt.ROW,
+    zaru.ROW,
+    nhc.ROW,
+)
+"""The facts of the measurements that `linearize` knows; signals of satellites are in `tight`."""
 
 UNKNOWN_STREAM = -1
 """Instead of a size, for a stream without a branch in `linearize`: it is refused with a record, never fused."""
@@ -55,7 +70,7 @@ def fuse(state, aids, i, settings, work):
 @njit
 def offer(state, aid, heading_before, settings, work):
     """Fuse one measurement or refuse it; ``heading_before`` (rad) is that of the prediction."""
-    if not is_aligned_for(state, aid.stream):
+    if not is_aligned_for(state, settings.needs[aid.stream]):
         wait_for_alignment(state, aid, settings, work)
         return
     if aid.stream == Stream.HEADING and aid.source == heading.IMU_ORIENTATION and state.heading_known == 1:
@@ -148,17 +163,15 @@ def measure(state, aid, heading_before, settings, work):
 
 
 @njit
-def is_aligned_for(state, stream):
-    """Say whether the start-up is far enough for a measurement of a stream."""
+def is_aligned_for(state, needs):
+    """Say whether the start-up is far enough for a measurement with these needs (sum of NEEDS_... of its row)."""
     if state.level_known == 0:
         return False
-    if stream == Stream.GNSS_POSITION:
-        return True
-    if stream in (Stream.GNSS_VELOCITY, Stream.HEADING, Stream.BARO):
-        return state.position_known == 1
-    if stream == Stream.MAG:
-        return state.position_known == 1 and state.mag.field_known == 1
-    return state.position_known == 1 and state.heading_known == 1
+    if needs & NEEDS_POSITION and state.position_known == 0:
+        return False
+    if needs & NEEDS_HEADING and state.heading_known == 0:
+        return False
+    return not (needs & NEEDS_FIELD and state.mag.field_known == 0)
 
 
 @njit

@@ -24,6 +24,7 @@ from eskf_ros.filter.integrity.receiver_monitor import RECEIVER_MONITOR
 from eskf_ros.filter.integrity.recovery import RECOVERY
 from eskf_ros.filter.measurements.mag import EARTH_FIELD
 from eskf_ros.filter.output.local_odometry import STEP
+from eskf_ros.filter.rows import ROWS
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import (
     ACCEL_BIAS,
@@ -106,35 +107,12 @@ SETTINGS = np.dtype(
         ("lever_arms_body", "f8", (SOURCES, 3)),
         ("gnss_time_offset", "f8", (SOURCES,)),
         ("solves_ranges", "i8"),
-        ("heading_lines_body", "f8", (SOURCES, 3)),
-        ("baro_arm_body", "f8", (3,)),
-        ("mag_to_imu", "f8", (3, 3)),
-        ("mag_strength_tolerance", "f8"),
-        ("mag_inclination_tolerance", "f8"),
-        ("mag_error_distance", "f8"),
-        ("is_orientation_magnetic", "i8"),
         ("gnss_covariance_scale", "f8"),
         ("correlated_share", "f8"),
-        ("zupt_velocity_std", "f8"),
-        ("zupt_rate_std", "f8"),
-        ("body_velocity_arm_body", "f8", (3,)),
-        ("body_velocity_axes_body", "f8", (3, 3)),
-        ("wheel_arm_body", "f8", (3,)),
-        ("wheel_slip", "f8"),
-        ("nhc_arm_body", "f8", (3,)),
-        ("nhc_lateral_std", "f8"),
-        ("nhc_vertical_std", "f8"),
-        ("nhc_angle_std", "f8"),
-        ("nhc_slip", "f8"),
-        # Ranges: lowest elevation (rad), factor on variances, floors (m, m/s), what lasts in their errors (m).
-        ("elevation_mask", "f8"),
-        ("range_covariance_scale", "f8"),
-        ("code_std_floor", "f8"),
-        ("range_rate_std_floor", "f8"),
-        ("range_error_std", "f8", (3,)),
         ("gate", "f8", (len(Stream), 4)),
         ("reach", "i8", (len(Stream),)),
         ("constrains", "i8", (len(Stream),)),
+        ("needs", "i8", (len(Stream),)),
         ("static_duration", "f8"),
         ("moving_start_after", "f8"),
         ("still_gyro_std", "f8"),
@@ -160,6 +138,7 @@ SETTINGS = np.dtype(
         ("remembered_heading_std", "f8"),
         ("output_interval", "i8"),
         *((f"{name}_at", "i8") for name in OPTIONAL_SIZES),
+        *((row.name, row.settings) for row in ROWS if row.settings.names),
         ("optional_std", "f8", (OPTIONAL_CAPACITY,)),
         ("optional_noise_density", "f8", (OPTIONAL_CAPACITY,)),
         ("optional_decay", "f8", (OPTIONAL_CAPACITY,)),
@@ -169,9 +148,9 @@ SETTINGS = np.dtype(
 """Parameters as the kernels use them: radians, body axes, gate thresholds by stream and degrees of freedom.
 
 ``reach``: how many errors have to be in use for a measurement of a stream. ``constrains``: which constraints are
-switched on. ``NAME_at``: place of an optional error, or
-`NOWHERE`. ``optional_*``, from the first place behind the core: standard deviation at first, white noise that drives it
-(unit/rtHz), inverse correlation time (1/s).
+switched on. ``needs``: what has to be known before a measurement of a stream is fused. ``NAME_at``: place of an
+augmented error, or `NOWHERE`. ``optional_*``, from the first place behind the core: standard deviation at first, white
+noise that drives it (unit/rtHz), inverse correlation time (1/s). The records behind them belong to the measurements.
 """
 
 

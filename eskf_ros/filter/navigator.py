@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from eskf_ros.filter.alignment.first_fix import place
 from eskf_ros.filter.alignment.heading_search import forget_search
-from eskf_ros.filter.alignment.warm_start import Memory, recall
+from eskf_ros.filter.alignment.warm_start import Memory
 from eskf_ros.filter.history.admission import ABSENT, admit
 from eskf_ros.filter.history.records import AID, IMU, RECORD, TIMELINE
 from eskf_ros.filter.history.timeline import (
@@ -33,9 +33,10 @@ from eskf_ros.filter.integrity.recovery import phase_of
 from eskf_ros.filter.layout import STATE, WORK, blank_state
 from eskf_ros.filter.loop import advance
 from eskf_ros.filter.measurements import heading, mag
+from eskf_ros.filter.measurements.heading import UNKNOWN_ANGLE_VARIANCE
 from eskf_ros.filter.output.global_odometry import ODOMETRY, status_of, write_odometry
 from eskf_ros.filter.output.local_odometry import LOCAL, note_jump
-from eskf_ros.filter.settings import UNKNOWN_ANGLE_VARIANCE, intakes_from, settings_from
+from eskf_ros.filter.settings import intakes_from, recall, settings_from
 from eskf_ros.filter.state.enums import Phase, Status, Stream, Verdict
 from eskf_ros.filter.state.error_state import ERROR_SIZE, INTER_SYSTEM
 from eskf_ros.filter.state.memory import allocate

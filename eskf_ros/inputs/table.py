@@ -13,7 +13,6 @@ the estimator it is a `Stream`, its `Intake` (`filter.settings`), a file in `fil
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
@@ -23,7 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.bags import POINT_CLOUD, Batch
+from eskf_ros.filter.measurements import gnss_position, gnss_velocity, wheel
+from eskf_ros.filter.measurements.row import Row, linear_covariances
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.filter.rows import SENSORS
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.inputs.epochs import RangeIntake
 from eskf_ros.parameters.tree import Parameters
@@ -31,7 +33,10 @@ from eskf_ros.parameters.tree import Parameters
 Arguments = Iterable[tuple[Any, ...]]
 Converter = Callable[[Batch], Arguments]
 
-UNMEASURED = -1.0
+
+FIX = gnss_position.ROW.types[0]
+TWIST = gnss_velocity.ROW.types[0]
+ODOMETRY = wheel.ROW.types[0]
 
 
 @dataclass(frozen=True)
@@ -92,20 +97,12 @@ def _fixes(batch: Batch) -> Arguments:
 
 
 def _gnss_velocities(batch: Batch) -> Arguments:
-    columns = _listed(batch.messages["stamp"]), _listed(batch.messages["linear_velocity"]), _listed(_linear(batch))
+    columns = (
+        _listed(batch.messages["stamp"]),
+        _listed(batch.messages["linear_velocity"]),
+        _listed(linear_covariances(batch.messages)),
+    )
     return zip(*columns, batch.log_time.tolist(), _frames(batch), strict=True)
-
-
-def _twist_covariances(batch: Batch) -> NDArray[np.float64]:
-    """Covariances (n, 6, 6) of the twists; all zero where the type of the messages has none."""
-    names = batch.messages.dtype.names or ()
-    given = batch.messages["twist_covariance"] if "twist_covariance" in names else np.zeros((len(batch.messages), 36))
-    return given.reshape(-1, 6, 6)
-
-
-def _linear(batch: Batch) -> NDArray[np.float64]:
-    """Covariances (n, 9) of the linear velocities."""
-    return _twist_covariances(batch)[:, :3, :3].reshape(-1, 9)
 
 
 def _vectors(batch: Batch, values: NDArray[Any], covariances: NDArray[Any]) -> Arguments:
@@ -114,67 +111,21 @@ def _vectors(batch: Batch, values: NDArray[Any], covariances: NDArray[Any]) -> A
     return zip(*columns, batch.log_time.tolist(), strict=True)
 
 
-def _headings(batch: Batch) -> Arguments:
-    """Yaw (0 = east, counter-clockwise) and pitch (down is positive) of an orientation, if there is one (REP-145)."""
-    messages = batch.messages
-    x, y, z, w = messages["orientation"].T
-    values, covariances = np.zeros((len(messages), 3)), np.zeros((len(messages), 9))
-    values[:, 0] = np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
-    values[:, 1] = np.arcsin(np.clip(2.0 * (w * y - x * z), -1.0, 1.0))
-    given = messages["orientation_covariance"]
-    covariances[:, 0], covariances[:, 4] = given[:, 8], given[:, 4]
-    covariances[given.any(axis=1), 8] = UNMEASURED
-    # Drivers that know the yaw only leave the pitch zero, and its variance.
-    covariances[(given[:, 8] > 0.0) & (given[:, 4] == 0.0), 4] = UNMEASURED
-    covariances[given[:, 0] == UNMEASURED] = UNMEASURED
-    values[np.abs(x * x + y * y + z * z + w * w - 1.0) > 0.1] = math.nan
-    return _vectors(batch, values, covariances)
+def _of_row(row: Row) -> Input:
+    """The input of a sensor that says of itself how its messages are read."""
 
+    def arguments(batch: Batch) -> Arguments:
+        assert row.read is not None
+        return _vectors(batch, *row.read(batch.messages))
 
-def _body_velocities(batch: Batch) -> Arguments:
-    return _vectors(batch, batch.messages["linear_velocity"], _linear(batch))
-
-
-def _wheels(batch: Batch) -> Arguments:
-    """Speed along x and yaw rate."""
-    messages = batch.messages
-    values = np.zeros((len(messages), 3))
-    values[:, 0] = messages["linear_velocity"][:, 0]
-    values[:, 1] = messages["angular_velocity"][:, 2]
-    covariance = _twist_covariances(batch)[:, [0, 0, 5, 5], [0, 5, 0, 5]]
-    return _vectors(batch, values, _padded(covariance))
-
-
-def _padded(two_by_two: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Covariances (n, 4) as (n, 9) with an axis that was not measured; all zero stays all zero."""
-    padded = np.zeros((len(two_by_two), 9))
-    padded[:, [0, 1, 3, 4]] = two_by_two
-    padded[two_by_two.any(axis=1), 8] = UNMEASURED
-    return padded
-
-
-def _mags(batch: Batch) -> Arguments:
-    return _vectors(batch, batch.messages["magnetic_field"], batch.messages["magnetic_field_covariance"])
-
-
-def _pressures(batch: Batch) -> Arguments:
-    messages = batch.messages
-    values, covariances = np.zeros((len(messages), 3)), np.zeros((len(messages), 9))
-    values[:, 0] = messages["fluid_pressure"]
-    covariances[:, 0] = messages["variance"]
-    covariances[messages["variance"] != 0.0, 4::4] = UNMEASURED
-    return _vectors(batch, values, covariances)
+    others = tuple((name, arguments) for name in row.types[1:])
+    return Input(row.name, row.stream, row.types[0], arguments, others, is_gnss=row.is_gnss, depth=row.depth)
 
 
 def _clouds(batch: Batch) -> Arguments:
     messages = batch.messages
     return zip(messages["stamp"].tolist(), messages["points"], batch.log_time.tolist(), strict=True)
 
-
-FIX = "sensor_msgs/msg/NavSatFix"
-ODOMETRY = "nav_msgs/msg/Odometry"
-TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
-BARE_TWIST = "geometry_msgs/msg/TwistStamped"
 
 INPUTS = (
     Input(
@@ -185,32 +136,22 @@ INPUTS = (
         push="push_gnss_position",
         is_gnss=True,
         by_receiver=True,
-        depth=50,
+        depth=gnss_position.ROW.depth,
     ),
     Input(
         "gnss_velocity",
         Stream.GNSS_VELOCITY,
         TWIST,
         _gnss_velocities,
-        ((BARE_TWIST, _gnss_velocities),),
+        tuple((name, _gnss_velocities) for name in gnss_velocity.ROW.types[1:]),
         push="push_gnss_velocity",
         is_gnss=True,
         by_receiver=True,
-        depth=50,
+        depth=gnss_velocity.ROW.depth,
     ),
-    Input("heading", Stream.HEADING, "sensor_msgs/msg/Imu", _headings, is_gnss=True, depth=50),
-    Input("mag", Stream.MAG, "sensor_msgs/msg/MagneticField", _mags),
-    Input("wheel", Stream.WHEEL, ODOMETRY, _wheels, ((TWIST, _wheels), (BARE_TWIST, _wheels))),
-    Input(
-        "body_velocity",
-        Stream.BODY_VELOCITY,
-        TWIST,
-        _body_velocities,
-        ((BARE_TWIST, _body_velocities), (ODOMETRY, _body_velocities)),
-    ),
+    *map(_of_row, SENSORS),
     Input("ephemerides", Stream.PSEUDORANGE, POINT_CLOUD, _clouds, push="take_ephemerides", depth=50, is_timed=False),
     Input("ranges", Stream.PSEUDORANGE, POINT_CLOUD, _clouds, push="take_ranges", is_gnss=True, depth=50),
-    Input("baro", Stream.BARO, "sensor_msgs/msg/FluidPressure", _pressures),
 )
 """All but the IMU. The order is that of messages with one log time."""
 

@@ -8,7 +8,7 @@ import sys
 import textwrap
 from pathlib import Path
 
-from eskf_ros.parameters.mapping import Leaf, _value, leaves
+from eskf_ros.parameters.mapping import Leaf, leaves, value_of
 from eskf_ros.parameters.schema import Value
 from eskf_ros.parameters.tree import Parameters
 
@@ -17,7 +17,7 @@ def to_yaml(parameters: Parameters | None = None) -> str:
     """A commented ROS parameter file with the given values (default: the defaults; that text is config/eskf.yaml)."""
     lines = [
         "# Parameters of eskf_ros with their defaults. Copy the file, keep the lines you change.",
-        "# Written from eskf_ros/parameters.py by `python -m eskf_ros.parameters`.",
+        "# Written from eskf_ros/parameters by `python -m eskf_ros.parameters`.",
         "# Write all numbers of a list with a decimal point: ROS refuses [1, 2.5].",
         "/**:",
         "  ros__parameters:",
@@ -42,7 +42,7 @@ def _yaml_group(group: type, prefix: str, parameters: Parameters, lines: list[st
         limits = f"Default {_yaml_value(leaf.default)}{unit}; {leaf.allowed()}; {change}."
         for text in (leaf.rule.description, limits):
             lines += textwrap.wrap(text, 116, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ")
-        value = _value(parameters, name)
+        value = value_of(parameters, name)
         if value == ():
             # ROS makes an empty list a parameter without a type, which no node can declare: show the form only.
             lines.append(f"{indent}# {item.name}: {_yaml_value((0.0,) * max(leaf.rule.lengths))}")
@@ -70,7 +70,7 @@ def to_markdown() -> str:
     lines = [
         "# Parameters",
         "",
-        "Written from `eskf_ros/parameters.py` by `python -m eskf_ros.parameters`; `config/eskf.yaml` holds the same",
+        "Written from `eskf_ros/parameters` by `python -m eskf_ros.parameters`; `config/eskf.yaml` holds the same",
         "as a file to copy. `eskf_replay --config FILE` reads ROS 2 parameter files; an unknown key, a wrong type or a",
         "value outside its range is an error that names it. Live parameters may change while the node runs, the others",
         "are read at start.",
@@ -97,7 +97,7 @@ def _markdown_table(members: list[Leaf]) -> list[str]:
 
 def main() -> int:
     """Write config/eskf.yaml and docs/parameters.md of the checkout this module lies in; returns the exit code."""
-    root = Path(__file__).resolve().parent.parent
+    root = Path(__file__).resolve().parents[2]
     if not (root / "setup.py").is_file():
         print(f"{root} is no checkout of eskf_ros: run this where the sources are", file=sys.stderr)
         return 2

@@ -113,10 +113,10 @@ def _leaves(group: type, prefix: str) -> Iterator[Leaf]:
 
 def to_mapping(parameters: Parameters) -> dict[str, Value]:
     """Dotted name -> value of every parameter."""
-    return {leaf.name: _value(parameters, leaf.name) for leaf in leaves()}
+    return {leaf.name: value_of(parameters, leaf.name) for leaf in leaves()}
 
 
-def _value(parameters: Parameters, name: str) -> Any:
+def value_of(parameters: Parameters, name: str) -> Any:
     value: Any = parameters
     for part in name.split("."):
         value = getattr(value, part)
@@ -132,7 +132,7 @@ def from_mapping(mapping: Mapping[str, object], source: str = "parameters") -> P
     known = {leaf.name: leaf for leaf in leaves()}
     problems: list[str] = []
     values: dict[str, Value] = {}
-    for name, raw in _flat(mapping, source).items():
+    for name, raw in flat(mapping, source).items():
         if name in known:
             try:
                 values[name] = known[name].convert(raw)
@@ -146,7 +146,7 @@ def from_mapping(mapping: Mapping[str, object], source: str = "parameters") -> P
     return parameters
 
 
-def _flat(mapping: Mapping[str, object], source: str) -> dict[str, object]:
+def flat(mapping: Mapping[str, object], source: str) -> dict[str, object]:
     values: dict[str, object] = {}
     problems: list[str] = []
     for name, value in _flatten(mapping, ""):

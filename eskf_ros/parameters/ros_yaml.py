@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from eskf_ros.parameters.mapping import _flat, from_mapping
+from eskf_ros.parameters.mapping import flat, from_mapping
 from eskf_ros.parameters.schema import ParameterError
 from eskf_ros.parameters.tree import Parameters
 
@@ -26,6 +26,11 @@ class _RosLoader(yaml.SafeLoader):
                 )
             seen.add(key_node.value)
         return super().construct_mapping(node, deep)
+
+
+_RosLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$"), list("-+.0123456789")
+)
 
 
 def load(path: Path, node_name: str = "eskf_node") -> Parameters:
@@ -66,7 +71,7 @@ def load(path: Path, node_name: str = "eskf_node") -> Parameters:
     for name, content in applying:
         if not isinstance(content, Mapping):
             raise ParameterError(source, [f"{name}: nothing below 'ros__parameters:'"])
-        merged.update(_flat(content, source))
+        merged.update(flat(content, source))
     return from_mapping(merged, source)
 
 

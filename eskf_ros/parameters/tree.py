@@ -1,25 +1,25 @@
 """The parameters of eskf_ros: names, units, defaults, ranges and what they mean.
 
-The dataclasses below are the only place where a parameter is defined. `config/eskf.yaml` and `docs/parameters.md`
-are written from them by `python -m eskf_ros.parameters`, and `load` reads the ROS 2 parameter files users write.
+The dataclasses below, and those in the files of the measurements (`filter.rows`), are the only places where a
+parameter is defined. `config/eskf.yaml` and `docs/parameters.md` are written from them by
+`python -m eskf_ros.parameters`, and `ros_yaml.load` reads the ROS 2 parameter files users write.
 
 Values are Python floats, integers, bools, strings and tuples of floats. Angles whose name ends in `_deg` are degrees,
-all others are in the SI unit stated with them. This module imports neither numpy nor ROS, so that reading a
-configuration costs no start-up time.
+all others are in the SI unit stated with them. Nothing here imports ROS.
 """
 
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
-from eskf_ros.parameters.ros_yaml import _RosLoader
+from eskf_ros.filter.rows import CONSTRAINTS, SENSORS
+from eskf_ros.filter.tight.signal import Ranges
 from eskf_ros.parameters.schema import (
     FRAME_NAME,
     TOPIC_NAME,
     TYPE_OF_TOPIC,
-    Aid,
     choice,
     group_of,
     parameter,
@@ -47,7 +47,47 @@ class Frames:
     )
 
 
+if TYPE_CHECKING:
+    from eskf_ros.filter.measurements.baro import Baro
+    from eskf_ros.filter.measurements.body_velocity import BodyVelocity
+    from eskf_ros.filter.measurements.heading import Heading
+    from eskf_ros.filter.measurements.mag import Mag
+    from eskf_ros.filter.measurements.nhc import Nhc
+    from eskf_ros.filter.measurements.wheel import Wheel
+    from eskf_ros.filter.measurements.zupt import Zupt
+
+
+def _with_topics(topics: type) -> type:
+    """Add the topic of each sensor of the estimator, and the choice of its type, before those of the ranges."""
+    fields: dict[str, Any] = {}
+    for name, kind in topics.__annotations__.items():
+        if name == "ranges":
+            for row in SENSORS:
+                fields[row.name] = str
+                setattr(topics, row.name, parameter(row.topic, "", row.topic_about, **TOPIC_NAME))
+                if len(row.types) > 1:
+                    fields[f"{row.name}_type"] = str
+                    setattr(topics, f"{row.name}_type", choice(row.types[0], TYPE_OF_TOPIC, *row.types[1:]))
+        fields[name] = kind
+    topics.__annotations__ = fields
+    return topics
+
+
+def _with_groups(parameters: type) -> type:
+    """Add the parameters of each sensor before those of the ranges, and of each constraint after them."""
+    fields: dict[str, Any] = {}
+    for name, kind in parameters.__annotations__.items():
+        for row in SENSORS if name == "ranges" else CONSTRAINTS if name == "estimate" else ():
+            if row.group is not None:
+                fields[row.name] = row.group
+                setattr(parameters, row.name, group_of(row.group, row.about))
+        fields[name] = kind
+    parameters.__annotations__ = fields
+    return parameters
+
+
 @dataclass(frozen=True)
+@_with_topics
 class Topics:
     imu: str = parameter(
         "imu/data", "", "sensor_msgs/Imu: angular rate and specific force (+g up at rest).", **TOPIC_NAME
@@ -62,39 +102,6 @@ class Topics:
     gnss_velocity_type: str = choice(
         "geometry_msgs/msg/TwistWithCovarianceStamped", TYPE_OF_TOPIC, "geometry_msgs/msg/TwistStamped"
     )
-    heading: str = parameter(
-        "gnss/heading",
-        "",
-        "sensor_msgs/Imu of a dual-antenna receiver: yaw (0 = east, counter-clockwise) and pitch of the baseline; one "
-        "whose variance is above 1 rad2 is not used.",
-        **TOPIC_NAME,
-    )
-    mag: str = parameter(
-        "imu/mag", "", "sensor_msgs/MagneticField: field in the axes of the magnetometer.", **TOPIC_NAME
-    )
-    wheel: str = parameter(
-        "wheel/odom", "", "nav_msgs/Odometry: wheel odometry, of which speed and yaw rate are used.", **TOPIC_NAME
-    )
-    wheel_type: str = choice(
-        "nav_msgs/msg/Odometry",
-        TYPE_OF_TOPIC,
-        "geometry_msgs/msg/TwistWithCovarianceStamped",
-        "geometry_msgs/msg/TwistStamped",
-    )
-    body_velocity: str = parameter(
-        "body_velocity",
-        "",
-        "geometry_msgs/TwistWithCovarianceStamped: velocity in the axes of the vehicle, of a DVL, optical flow, radar "
-        "or odometry of any kind; an axis with a negative variance is absent.",
-        **TOPIC_NAME,
-    )
-    body_velocity_type: str = choice(
-        "geometry_msgs/msg/TwistWithCovarianceStamped",
-        TYPE_OF_TOPIC,
-        "geometry_msgs/msg/TwistStamped",
-        "nav_msgs/msg/Odometry",
-    )
-    baro: str = parameter("baro", "", "sensor_msgs/FluidPressure: air pressure.", **TOPIC_NAME)
     ranges: str = parameter(
         "gnss/ranges",
         "",
@@ -336,431 +343,6 @@ class SecondGnss:
 
 
 @dataclass(frozen=True)
-class Heading(Aid):
-    mount_rpy_deg: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0),
-        "deg",
-        "Orientation of the baseline in base_link, whose yaw and pitch the messages tell: roll, pitch, yaw about fixed "
-        "axes as in a URDF, of a frame whose x axis leads from the first antenna (of u-blox: the moving base) to the "
-        "second. [0.0, 0.0, 0.0]: the second is in front; [0.0, 0.0, 90.0]: it is on the left; [0.0, 0.0, 180.0]: it "
-        "is behind.",
-        minimum=-360.0,
-        maximum=360.0,
-    )
-    offset_std_deg: float = parameter(
-        0.5,
-        "deg",
-        "Standard deviation at first of what all messages are wrong by alike: how well the baseline is known in "
-        "base_link, and multipath at the antennas. It is estimated as the vehicle accelerates; 0: there is none.",
-        minimum=0.0,
-        maximum=90.0,
-    )
-    offset_random_walk: float = parameter(
-        2.0e-4,
-        "rad/rtHz",
-        "How fast that wanders: by this value times the square root of the seconds passed. The default is 0.36 deg in "
-        "1000 s.",
-        minimum=0.0,
-        maximum=1.0,
-    )
-    std_floor_deg: float = parameter(
-        0.2, "deg", "The standard deviation is never taken smaller than this.", above=0.0, maximum=90.0, live=True
-    )
-    unknown_std_deg: float = parameter(
-        1.0, "deg", "Standard deviation where the message gives none.", above=0.0, maximum=90.0, live=True
-    )
-
-
-@dataclass(frozen=True)
-class Mag(Aid):
-    use: bool = parameter(
-        False,
-        "",
-        "Fuse the heading that the magnetometer shows. Off unless asked for: in vehicles, indoors and near iron it "
-        "misleads.",
-        live=True,
-    )
-    mount_rpy_deg: tuple[float, ...] = parameter(
-        (),
-        "deg",
-        "Orientation of the magnetometer in base_link: roll, pitch, yaw about fixed axes as in a URDF. "
-        "Empty: its axes are those of the IMU.",
-        lengths=(0, 3),
-        minimum=-360.0,
-        maximum=360.0,
-    )
-    declination_deg: float = parameter(
-        math.nan,
-        "deg",
-        "Angle from true north to magnetic north, east positive. .nan: from the World Magnetic Model for the place of "
-        "the fixes and the date of their stamps, for which the Python package pygeomag must be installed.",
-        minimum=-180.0,
-        maximum=180.0,
-        nan_allowed=True,
-    )
-    error_std_deg: float = parameter(
-        4.0,
-        "deg",
-        "Standard deviation of the heading error that remains after calibration, by iron in the vehicle and nearby. It "
-        "does not average out while the vehicle stands.",
-        above=0.0,
-        maximum=180.0,
-    )
-    error_distance: float = parameter(
-        50.0,
-        "m",
-        "Having travelled so far, or turned by one radian, the vehicle meets another such error.",
-        above=0.0,
-        maximum=1.0e6,
-    )
-    strength_tolerance: float = parameter(
-        0.15,
-        "",
-        "A field is taken for disturbed where its strength differs by more than this part from that of the World "
-        "Magnetic Model. Without the model nothing is checked.",
-        above=0.0,
-        maximum=10.0,
-        live=True,
-    )
-    inclination_tolerance_deg: float = parameter(
-        8.0,
-        "deg",
-        "The same for its inclination (dip).",
-        above=0.0,
-        maximum=180.0,
-        live=True,
-    )
-    std_floor: float = parameter(
-        1.0e-6,
-        "T",
-        "The standard deviation per axis is never taken smaller than this.",
-        above=0.0,
-        maximum=1.0,
-        live=True,
-    )
-    unknown_std: float = parameter(
-        1.0e-6, "T", "Standard deviation per axis where the message gives none.", above=0.0, maximum=1.0, live=True
-    )
-
-
-@dataclass(frozen=True)
-class Wheel(Aid):
-    position: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0),
-        "m",
-        "The point of base_link whose forward speed the wheels show: the middle of the axle they are on, or the place "
-        "of a single wheel.",
-        minimum=-1000.0,
-        maximum=1000.0,
-    )
-    slip: float = parameter(
-        0.005,
-        "s2/m",
-        "Tyres slip by this share of the speed for every m/s2 of acceleration. The default is that of a car on dry "
-        "asphalt; loose ground takes several times as much.",
-        minimum=0.0,
-        maximum=1.0,
-        live=True,
-    )
-    speed_std_floor: float = parameter(
-        0.05,
-        "m/s",
-        "The standard deviation of the speed is never taken smaller than this.",
-        above=0.0,
-        maximum=100.0,
-        live=True,
-    )
-    yaw_rate_std_floor: float = parameter(
-        0.02,
-        "rad/s",
-        "The standard deviation of the yaw rate is never taken smaller than this.",
-        above=0.0,
-        maximum=10.0,
-        live=True,
-    )
-    unknown_speed_std: float = parameter(
-        0.1, "m/s", "Standard deviation of the speed where the message gives none.", above=0.0, maximum=100.0, live=True
-    )
-    unknown_yaw_rate_std: float = parameter(
-        0.1,
-        "rad/s",
-        "Standard deviation of the yaw rate where the message gives none.",
-        above=0.0,
-        maximum=10.0,
-        live=True,
-    )
-
-
-@dataclass(frozen=True)
-class BodyVelocity(Aid):
-    std_floor: float = parameter(
-        0.02,
-        "m/s",
-        "The standard deviation per axis is never taken smaller than this.",
-        above=0.0,
-        maximum=100.0,
-        live=True,
-    )
-    unknown_std: float = parameter(
-        0.2, "m/s", "Standard deviation per axis where the message gives none.", above=0.0, maximum=100.0, live=True
-    )
-    mount_position: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0), "m", "Position of the sensor in base_link.", minimum=-1000.0, maximum=1000.0
-    )
-    mount_rpy_deg: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0),
-        "deg",
-        "Orientation of the axes of its velocity in base_link: roll, pitch, yaw about fixed axes as in a URDF.",
-        minimum=-360.0,
-        maximum=360.0,
-    )
-
-
-@dataclass(frozen=True)
-class Baro(Aid):
-    position: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0),
-        "m",
-        "Position of the barometer in base_link, x forward, y left, z up.",
-        minimum=-1000.0,
-        maximum=1000.0,
-    )
-    offset_std: float = parameter(
-        300.0,
-        "m",
-        "Standard deviation at first of the difference between pressure altitude and height: weather and geoid. "
-        "It is estimated.",
-        above=0.0,
-        maximum=1.0e4,
-    )
-    offset_random_walk: float = parameter(
-        0.1,
-        "m/s/rtHz",
-        "How fast that difference wanders, by weather, wind and warming up: by this value times the square root of the "
-        "seconds passed. The default is 6 m in one hour; more where air is blown about, as in a vehicle.",
-        minimum=0.0,
-        maximum=100.0,
-    )
-    scale_std: float = parameter(
-        0.03,
-        "",
-        "Standard deviation of the factor by which pressure altitude grows faster or slower than height: 0.03 where "
-        "the air is 9 K warmer or colder than in the standard atmosphere. It is estimated.",
-        minimum=0.0,
-        maximum=1.0,
-    )
-    std_floor: float = parameter(
-        3.0, "Pa", "The standard deviation is never taken smaller than this.", above=0.0, maximum=1.0e4, live=True
-    )
-    unknown_std: float = parameter(
-        10.0, "Pa", "Standard deviation where the message gives none.", above=0.0, maximum=1.0e4, live=True
-    )
-
-
-@dataclass(frozen=True)
-class Ranges(Aid):
-    use: bool = parameter(
-        True,
-        "",
-        "Fuse the pseudoranges of topics.ranges in mode tight.",
-        live=True,
-    )
-    use_doppler: bool = parameter(True, "", "Fuse the Doppler of topics.ranges in mode tight.", live=True)
-    time_offset: float = parameter(
-        0.0,
-        "s",
-        "Added to the stamps: true time = stamp + offset. RINEX files are stamped with UTC: -18 or 18 s may be missing "
-        "where a recording is stamped with GPS time.",
-        minimum=-100.0,
-        maximum=100.0,
-    )
-    gate_probability: float = parameter(
-        0.99994,
-        "",
-        "Gate of each signal: the share of good measurements that passes; 0.99994 is four standard deviations. From "
-        "2.5 on they are weighed down.",
-        above=0.0,
-        below=1.0,
-        live=True,
-    )
-    code_std_floor: float = parameter(
-        0.3,
-        "m",
-        "The standard deviation of a pseudorange is never taken smaller than this.",
-        above=0.0,
-        maximum=1000.0,
-        live=True,
-    )
-    range_rate_std_floor: float = parameter(
-        0.03,
-        "m/s",
-        "The standard deviation of a range rate (Doppler) is never taken smaller than this.",
-        above=0.0,
-        maximum=100.0,
-        live=True,
-    )
-    elevation_mask_deg: float = parameter(
-        10.0, "deg", "Satellites below this elevation are not used.", minimum=-90.0, maximum=90.0, live=True
-    )
-    cn0_mask: float = parameter(
-        28.0,
-        "dB-Hz",
-        "Signals whose carrier-to-noise density is below this are not used; an unknown one passes.",
-        minimum=0.0,
-        maximum=60.0,
-        live=True,
-    )
-    clock_drift_noise: float = parameter(
-        0.3,
-        "m/s/rts",
-        "How fast the drift of the receiver's clock wanders: by this value times the square root of the seconds "
-        "passed. 0.1 geodetic receiver, 0.3 usual, 0.6 hand-held or shaken. Too small makes one or two satellites "
-        "worse than none.",
-        minimum=0.0,
-        maximum=1.0e3,
-        live=True,
-    )
-    clock_bias_noise: float = parameter(
-        0.1,
-        "m/rts",
-        "How fast the bias of the receiver's clock wanders besides its drift.",
-        minimum=0.0,
-        maximum=1.0e3,
-        live=True,
-    )
-    correlation_time: float = parameter(
-        120.0,
-        "s",
-        "How long the common error of the pseudoranges lasts (e-folding time): reflections, orbits, what the models "
-        "leave of the atmosphere. 0: not modelled, and the estimate then trusts the mean of many epochs too much.",
-        minimum=0.0,
-        maximum=1.0e5,
-    )
-    correlated_std: float = parameter(
-        1.5,
-        "m",
-        "With a correlation_time: the standard deviation of a position by errors that last, per horizontal axis ...",
-        above=0.0,
-        maximum=1000.0,
-        live=True,
-    )
-    correlated_std_vertical: float = parameter(
-        3.0,
-        "m",
-        "... and vertically, where the atmosphere is not averaged out. More without parameters of the ionosphere for "
-        "the day (5 m): the stand-in may be wrong by its own size.",
-        above=0.0,
-        maximum=1000.0,
-        live=True,
-    )
-    inter_system_std: float = parameter(
-        10.0,
-        "m",
-        "Standard deviation of the offset between a constellation and GPS in the receiver at first.",
-        above=0.0,
-        maximum=1.0e4,
-    )
-    inter_system_std_glonass: float = parameter(30.0, "m", "The same for GLONASS.", above=0.0, maximum=1.0e4)
-    inter_system_noise: float = parameter(
-        0.02, "m/rts", "How fast these offsets wander.", minimum=0.0, maximum=100.0, live=True
-    )
-    use_point_solution: bool = parameter(
-        False,
-        "",
-        "In mode loose: solve each epoch of topics.ranges for position and velocity, and fuse these instead of the "
-        "receiver's own fixes.",
-    )
-    rinex_nav_files: str = parameter(
-        "",
-        "",
-        "RINEX navigation files with the orbits and clocks of the satellites, separated by colons. Empty: they come "
-        "by topics.ephemerides, or topics.ranges brings the satellites itself.",
-        pattern=r"[^\0]*",
-        pattern_text="paths separated by colons, or nothing",
-    )
-
-
-@dataclass(frozen=True)
-class Zupt:
-    enabled: bool = parameter(
-        True,
-        "",
-        "While the vehicle stands still, hold velocity and turn rate at zero. Wheels, GNSS and the spread of the IMU's "
-        "readings tell when it does.",
-        live=True,
-    )
-    velocity_std: float = parameter(
-        0.02,
-        "m/s",
-        "Standard deviation of the velocity of a vehicle that stands: it sways on its springs.",
-        above=0.0,
-        maximum=10.0,
-        live=True,
-    )
-    rate_std: float = parameter(
-        1.0e-4,
-        "rad/s",
-        "Standard deviation of its turn rate, as a mean over one second.",
-        above=0.0,
-        maximum=1.0,
-        live=True,
-    )
-
-
-@dataclass(frozen=True)
-class Nhc:
-    enabled: bool = parameter(
-        False,
-        "",
-        "For vehicles on wheels: they move neither sideways nor up and down at the rear axle (non-holonomic "
-        "constraint).",
-        live=True,
-    )
-    position: tuple[float, ...] = parameter(
-        (0.0, 0.0, 0.0),
-        "m",
-        "The point of base_link that does not move sideways: the middle of the axle that does not steer, usually the "
-        "rear one.",
-        minimum=-1000.0,
-        maximum=1000.0,
-    )
-    lateral_std: float = parameter(
-        0.05,
-        "m/s",
-        "Standard deviation of the lateral velocity, however slow the vehicle is.",
-        above=0.0,
-        maximum=100.0,
-        live=True,
-    )
-    vertical_std: float = parameter(
-        0.1,
-        "m/s",
-        "The same of the vertical velocity: bumps and springs.",
-        above=0.0,
-        maximum=100.0,
-        live=True,
-    )
-    angle_std_deg: float = parameter(
-        0.3,
-        "deg",
-        "How far the direction of travel differs from the axes of the vehicle on a straight road (camber, side wind), "
-        "as a standard deviation.",
-        minimum=0.0,
-        maximum=90.0,
-        live=True,
-    )
-    slip: float = parameter(
-        0.01,
-        "rad s2/m",
-        "What acceleration adds to this angle, by side slip of the tyres in turns, and by springs, for every m/s2. The "
-        "default is about twice what a car shows, because these errors last for seconds.",
-        minimum=0.0,
-        maximum=1.0,
-        live=True,
-    )
-
-
-@dataclass(frozen=True)
 class Estimate:
     wheel_scale: bool = parameter(
         True,
@@ -969,6 +551,7 @@ class Output:
 
 
 @dataclass(frozen=True)
+@_with_groups
 class Parameters:
     """Every parameter; `Parameters()` holds the defaults, `dataclasses.replace` changes a copy."""
 
@@ -995,21 +578,17 @@ class Parameters:
     second_gnss: SecondGnss = group_of(
         SecondGnss, "A second GNSS receiver with an antenna of its own; all else is as for the first."
     )
-    heading: Heading = group_of(Heading, "Heading of a dual-antenna receiver.")
-    mag: Mag = group_of(Mag, "Magnetometer.")
-    wheel: Wheel = group_of(Wheel, "Wheel odometry.")
-    body_velocity: BodyVelocity = group_of(BodyVelocity, "Velocity in the axes of the vehicle.")
-    baro: Baro = group_of(Baro, "Barometer.")
+    if TYPE_CHECKING:  # from the rows of the measurements, for the checker only
+        heading: Heading = Heading()
+        mag: Mag = Mag()
+        wheel: Wheel = Wheel()
+        body_velocity: BodyVelocity = BodyVelocity()
+        baro: Baro = Baro()
+        zupt: Zupt = Zupt()
+        nhc: Nhc = Nhc()
     ranges: Ranges = group_of(Ranges, "What a GNSS receiver measures of each satellite: pseudorange and Doppler.")
-    zupt: Zupt = group_of(Zupt, "Standing still.")
-    nhc: Nhc = group_of(Nhc, "Non-holonomic constraint.")
     estimate: Estimate = group_of(Estimate, "What is estimated besides the motion and the biases of the IMU.")
     history: History = group_of(History, "Late and out-of-order messages.")
     alignment: Alignment = group_of(Alignment, "Start-up: levelling, heading, and when the estimate is called good.")
     warm_start: WarmStart = group_of(WarmStart, "What the node remembers of its last run.")
     output: Output = group_of(Output, "What the node publishes, and how.")
-
-
-_RosLoader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$"), list("-+.0123456789")
-)

@@ -188,6 +188,9 @@ def _say(text: str) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    from eskf_ros.parameters.ros_yaml import load
+    from eskf_ros.parameters.schema import ParameterError
+    from eskf_ros.parameters.tree import Parameters
 
     folders = [_folder(bag, options.out) for bag in options.bags]
     for folder in folders:

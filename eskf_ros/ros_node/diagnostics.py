@@ -12,6 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from eskf_ros.filter.rows import SENSORS as ROWS_OF_SENSORS
 from eskf_ros.filter.state.enums import STREAM_NAMES, Phase, Status, Stream, Verdict
 from eskf_ros.filter.state.error_state import SOURCES
 from eskf_ros.filter.tight.signal import name_of
@@ -40,7 +41,7 @@ PHASE_LABELS = {
     Stream.PSEUDORANGE: "position by pseudoranges",
 }
 SENSORS = (
-    *((stream, 0) for stream in (Stream.HEADING, Stream.MAG, Stream.WHEEL, Stream.BODY_VELOCITY, Stream.BARO)),
+    *((row.stream, 0) for row in ROWS_OF_SENSORS),
     *((stream, source) for stream in (Stream.GNSS_POSITION, Stream.GNSS_VELOCITY) for source in range(SOURCES)),
 )
 """Streams, and for receivers which of them, whose phase is told once something came."""

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from eskf_ros.filter.measurements.row import Place
+from eskf_ros.filter.rows import SENSORS
 from eskf_ros.parameters.mapping import to_mapping
 from eskf_ros.parameters.tree import Parameters
 
@@ -16,28 +17,13 @@ Pose = tuple[np.ndarray, np.ndarray]
 """Position (3,) m and rotation matrix (3, 3) of a frame in another."""
 
 IMU, ANTENNA, SECOND_ANTENNA = "IMU", "GNSS antenna", "second GNSS antenna"
-MAGNETOMETER, BAROMETER = "magnetometer", "barometer"
-DUAL_ANTENNA, BODY_VELOCITY = "dual antenna", "velocity sensor"
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where a sensor sits: parameters of its position and orientation (empty: of no account), inputs that name it."""
-
-    position: str = ""
-    rotation: str = ""
-    inputs: tuple[str, ...] = ()
-
 
 PLACES = {
     IMU: Place("imu.mount_position", "imu.mount_rpy_deg"),
     # Not by the velocities: many drivers name the axes they are given in.
     ANTENNA: Place("gnss.lever_arm", inputs=("gnss_fix", "ranges")),
     SECOND_ANTENNA: Place("second_gnss.lever_arm"),
-    MAGNETOMETER: Place(rotation="mag.mount_rpy_deg", inputs=("mag",)),
-    BAROMETER: Place("baro.position", inputs=("baro",)),
-    DUAL_ANTENNA: Place(rotation="heading.mount_rpy_deg", inputs=("heading",)),
-    BODY_VELOCITY: Place("body_velocity.mount_position", "body_velocity.mount_rpy_deg", ("body_velocity",)),
+    **{row.label: row.place for row in SENSORS if row.place},
 }
 """One row for each sensor whose place in base_link counts."""
 

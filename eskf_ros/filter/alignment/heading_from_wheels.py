@@ -33,7 +33,7 @@ def search_with_wheels(state, payload, gate, settings, work):
         return
     rotation = to_matrix(state.attitude)
     forward, _left, _up = vehicle_axes(state, settings)
-    sway = cross(body_rate(state, rotation), settings.wheel_arm_body)
+    sway = cross(body_rate(state, rotation), settings.wheel.arm_body)
     speed = payload[0]
     motion = rotate(
         rotation, (speed * forward[0] - sway[0], speed * forward[1] - sway[1], speed * forward[2] - sway[2])

@@ -9,15 +9,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from eskf_ros.compiled import njit
-from eskf_ros.geodesy.earth import EARTH_RATE, STANDARD_GRAVITY, east_north_up_to_ecef, geodetic_to_ecef
+from eskf_ros.geodesy.earth import EARTH_RATE, STANDARD_GRAVITY
 from eskf_ros.geodesy.rotation import dot
-from eskf_ros.parameters.tree import Parameters
-
-SWITCHED_ON_SHARE = 0.1
-"""Switching off and on, and another temperature, move a bias by this share of its standard deviation at start."""
 
 CONTRADICTION = 5.0
 """Sigma beyond which a reading at rest contradicts a remembered bias."""
@@ -40,28 +34,6 @@ class Memory:
     accel_bias_std: tuple[float, ...]
     gyro_bias: tuple[float, ...]
     gyro_bias_std: tuple[float, ...]
-
-
-def recall(memory: Memory, age: float, parameters: Parameters, settings: np.ndarray) -> None:
-    """Write a memory ``age`` seconds old into the settings (SETTINGS), with the uncertainty it has by now."""
-    imu, warm = parameters.imu, parameters.warm_start
-    for name, at_start, walk in (
-        ("accel_bias", imu.accel_bias_std, imu.accel_bias_random_walk),
-        ("gyro_bias", imu.gyro_bias_std, imu.gyro_bias_random_walk),
-    ):
-        at_end = max(getattr(memory, f"{name}_std"))
-        std = math.sqrt(at_end**2 + walk**2 * age + (SWITCHED_ON_SHARE * at_start) ** 2)
-        settings[f"remembered_{name}"] = getattr(memory, name)
-        settings[f"remembered_{name}_std"] = min(std, at_start)
-    latitude, longitude = math.radians(memory.latitude_deg), math.radians(memory.longitude_deg)
-    heading = math.radians(memory.heading_deg)
-    forward = (math.cos(heading), math.sin(heading), 0.0)
-    settings["remembered_place_ecef"] = geodetic_to_ecef(latitude, longitude, memory.altitude)
-    settings["remembered_place_std"] = memory.position_std
-    settings["remembered_place_tolerance"] = warm.position_tolerance
-    settings["remembered_forward_ecef"] = np.array(east_north_up_to_ecef(latitude, longitude)) @ forward
-    settings["remembered_heading_std"] = math.radians(math.hypot(memory.heading_std_deg, warm.heading_std_deg))
-    settings["has_memory"] = 1
 
 
 @njit

@@ -11,11 +11,29 @@ with offset and scale as optional states.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
 from eskf_ros.compiled import njit
 from eskf_ros.filter.measurements.jacobians import clear
+from eskf_ros.filter.measurements.row import (
+    NEEDS_POSITION,
+    UNMEASURED,
+    OptionalBlock,
+    Place,
+    Readings,
+    Row,
+    arm_body,
+    threefold,
+)
+from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, POSITION
 from eskf_ros.geodesy.earth import east_north_up_to_ecef, ecef_to_geodetic
 from eskf_ros.geodesy.rotation import cross, rotate, rotate_back, to_matrix
+from eskf_ros.parameters.schema import Aid, parameter
 
 STANDARD_PRESSURE = 101325.0
 TEMPERATURE_HEIGHT = 288.15 / 0.0065
@@ -33,7 +51,7 @@ def pressure_altitude(pressure):
 @njit
 def place_of_sensor(state, settings):
     """Return latitude, longitude (rad) and height (m) of the barometer, and its place from the IMU in map axes."""
-    p, arm = state.position_map, settings.baro_arm_body
+    p, arm = state.position_map, settings.baro.arm_body
     lever = rotate(to_matrix(state.attitude), (arm[0], arm[1], arm[2]))
     offset = rotate(state.frame.map_to_ecef, (p[0] + lever[0], p[1] + lever[1], p[2] + lever[2]))
     origin = state.frame.origin_ecef
@@ -71,3 +89,116 @@ def linearize(state, payload, source, settings, work):
     work.jacobian[0, settings.baro_offset_at] = 1.0
     work.jacobian[0, settings.baro_scale_at] = height - state.frame.datum[2]
     return 1
+
+
+@dataclass(frozen=True)
+class Baro(Aid):
+    position: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0),
+        "m",
+        "Position of the barometer in base_link, x forward, y left, z up.",
+        minimum=-1000.0,
+        maximum=1000.0,
+    )
+    offset_std: float = parameter(
+        300.0,
+        "m",
+        "Standard deviation at first of the difference between pressure altitude and height: weather and geoid. "
+        "It is estimated.",
+        above=0.0,
+        maximum=1.0e4,
+    )
+    offset_random_walk: float = parameter(
+        0.1,
+        "m/s/rtHz",
+        "How fast that difference wanders, by weather, wind and warming up: by this value times the square root of the "
+        "seconds passed. The default is 6 m in one hour; more where air is blown about, as in a vehicle.",
+        minimum=0.0,
+        maximum=100.0,
+    )
+    scale_std: float = parameter(
+        0.03,
+        "",
+        "Standard deviation of the factor by which pressure altitude grows faster or slower than height: 0.03 where "
+        "the air is 9 K warmer or colder than in the standard atmosphere. It is estimated.",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    std_floor: float = parameter(
+        3.0, "Pa", "The standard deviation is never taken smaller than this.", above=0.0, maximum=1.0e4, live=True
+    )
+    unknown_std: float = parameter(
+        10.0, "Pa", "Standard deviation where the message gives none.", above=0.0, maximum=1.0e4, live=True
+    )
+
+
+SETTINGS = np.dtype([("arm_body", "f8", (3,))], align=True)
+"""Where the barometer sits (m from the IMU, in its axes)."""
+
+HIGHEST_PRESSURE = 1.2e5
+"""Pa; no barometer on a robot reports more."""
+
+LOWEST_PRESSURE = 1.0e4
+"""Pa, at 16 km; what a driver that reports hectopascal sends is below it."""
+
+
+def read(messages: npt.NDArray[Any]) -> Readings:
+    """Air pressure (Pa); the other axes are absent."""
+    values, covariances = np.zeros((len(messages), 3)), np.zeros((len(messages), 9))
+    values[:, 0] = messages["fluid_pressure"]
+    covariances[:, 0] = messages["variance"]
+    covariances[messages["variance"] != 0.0, 4::4] = UNMEASURED
+    return values, covariances
+
+
+def limits(baro: Baro) -> dict[str, Any]:
+    """Particulars of the `Intake`."""
+    return {
+        "std_floor": threefold(baro.std_floor),
+        "unknown_std": threefold(baro.unknown_std),
+        "largest": HIGHEST_PRESSURE,
+        "may_lack_axes": True,
+        "lowest": LOWEST_PRESSURE,
+    }
+
+
+def describe(settings: np.void, parameters: Any) -> None:
+    """Fill in `SETTINGS`."""
+    settings["arm_body"] = arm_body(parameters.baro.position, parameters)
+
+
+def augmented(parameters: Any) -> tuple[OptionalBlock, ...]:
+    """Weather and geoid, and the temperature of the air.
+
+    Not by whether the sensor is used, which may change while running: places stay.
+    """
+    baro: Baro = parameters.baro
+    return (
+        OptionalBlock(
+            "baro_offset",
+            is_on=True,
+            std=baro.offset_std,
+            noise_density=baro.offset_random_walk,
+            streams=(Stream.BARO,),
+        ),
+        OptionalBlock("baro_scale", is_on=True, std=baro.scale_std, streams=(Stream.BARO,)),
+    )
+
+
+ROW = Row(
+    Stream.BARO,
+    "barometer",
+    Baro,
+    "Barometer.",
+    types=("sensor_msgs/msg/FluidPressure",),
+    topic="baro",
+    topic_about="sensor_msgs/FluidPressure: air pressure.",
+    read=read,
+    limits=limits,
+    needs=NEEDS_POSITION,
+    augmented=augmented,
+    place=Place("baro.position", inputs=("baro",)),
+    settings=SETTINGS,
+    describe=describe,
+)
+"""The facts of this measurement."""

@@ -7,10 +7,28 @@ the gyro bias (Groves, section 14.3.1).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import body_rate
 from eskf_ros.filter.measurements.jacobians import clear, gyro_noise_variance, point_velocity, set_point_velocity_row
+from eskf_ros.filter.measurements.row import (
+    HIGHEST_SPEED,
+    Place,
+    Readings,
+    Row,
+    arm_body,
+    linear_covariances,
+    threefold,
+    to_base,
+)
+from eskf_ros.filter.state.enums import Stream
 from eskf_ros.geodesy.rotation import cross, dot, to_matrix
+from eskf_ros.parameters.schema import Aid, parameter
 
 COVARIANCES = ((3, 4, 5), (4, 6, 7), (5, 7, 8))
 """Where the covariance of two axes is in the payload."""
@@ -19,7 +37,7 @@ COVARIANCES = ((3, 4, 5), (4, 6, 7), (5, 7, 8))
 @njit
 def axis_of(settings, i):
     """Return an axis of the sensor as a unit vector in IMU axes."""
-    axes = settings.body_velocity_axes_body
+    axes = settings.body_velocity.axes_body
     return (axes[i, 0], axes[i, 1], axes[i, 2])
 
 
@@ -27,7 +45,7 @@ def axis_of(settings, i):
 def predict(state, settings):
     """Return the velocity (m/s) that the sensor should show along its three axes."""
     rotation = to_matrix(state.attitude)
-    velocity = point_velocity(state, rotation, body_rate(state, rotation), settings.body_velocity_arm_body)
+    velocity = point_velocity(state, rotation, body_rate(state, rotation), settings.body_velocity.arm_body)
     return (
         dot(axis_of(settings, 0), velocity),
         dot(axis_of(settings, 1), velocity),
@@ -40,7 +58,7 @@ def linearize(state, payload, settings, work):
     """Write innovation, Jacobian and noise of the measured axes to ``work``; return how many there are."""
     clear(work)
     rotation = to_matrix(state.attitude)
-    arm = settings.body_velocity_arm_body
+    arm = settings.body_velocity.arm_body
     predicted = predict(state, settings)
     rate_variance = gyro_noise_variance(state, settings)
     row = 0
@@ -62,3 +80,76 @@ def linearize(state, payload, settings, work):
             column += 1
         row += 1
     return row
+
+
+@dataclass(frozen=True)
+class BodyVelocity(Aid):
+    std_floor: float = parameter(
+        0.02,
+        "m/s",
+        "The standard deviation per axis is never taken smaller than this.",
+        above=0.0,
+        maximum=100.0,
+        live=True,
+    )
+    unknown_std: float = parameter(
+        0.2, "m/s", "Standard deviation per axis where the message gives none.", above=0.0, maximum=100.0, live=True
+    )
+    mount_position: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0), "m", "Position of the sensor in base_link.", minimum=-1000.0, maximum=1000.0
+    )
+    mount_rpy_deg: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0),
+        "deg",
+        "Orientation of the axes of its velocity in base_link: roll, pitch, yaw about fixed axes as in a URDF.",
+        minimum=-360.0,
+        maximum=360.0,
+    )
+
+
+SETTINGS = np.dtype([("arm_body", "f8", (3,)), ("axes_body", "f8", (3, 3))], align=True)
+"""Where the sensor measures (m from the IMU, in its axes), and the axes of its velocity as rows (IMU axes)."""
+
+TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
+BARE_TWIST = "geometry_msgs/msg/TwistStamped"
+ODOMETRY = "nav_msgs/msg/Odometry"
+
+
+def read(messages: npt.NDArray[Any]) -> Readings:
+    """Velocity (m/s) in the axes of the sensor."""
+    return messages["linear_velocity"], linear_covariances(messages)
+
+
+def limits(body: BodyVelocity) -> dict[str, Any]:
+    """Particulars of the `Intake`."""
+    return {
+        "std_floor": threefold(body.std_floor),
+        "unknown_std": threefold(body.unknown_std),
+        "largest": HIGHEST_SPEED,
+        "may_lack_axes": True,
+    }
+
+
+def describe(settings: np.void, parameters: Any) -> None:
+    """Fill in `SETTINGS`."""
+    body: BodyVelocity = parameters.body_velocity
+    settings["arm_body"] = arm_body(body.mount_position, parameters)
+    settings["axes_body"] = to_base(body.mount_rpy_deg).T @ to_base(parameters.imu.mount_rpy_deg)
+
+
+ROW = Row(
+    Stream.BODY_VELOCITY,
+    "velocity sensor",
+    BodyVelocity,
+    "Velocity in the axes of the vehicle.",
+    types=(TWIST, BARE_TWIST, ODOMETRY),
+    topic="body_velocity",
+    topic_about="geometry_msgs/TwistWithCovarianceStamped: velocity in the axes of the vehicle, of a DVL, optical "
+    "flow, radar or odometry of any kind; an axis with a negative variance is absent.",
+    read=read,
+    limits=limits,
+    place=Place("body_velocity.mount_position", "body_velocity.mount_rpy_deg", ("body_velocity",)),
+    settings=SETTINGS,
+    describe=describe,
+)
+"""The facts of this measurement."""

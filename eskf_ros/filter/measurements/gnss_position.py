@@ -10,9 +10,12 @@ root of the share times an optional state of unit variance (first-order Gauss-Ma
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.measurements.jacobians import clear, set_east_north_up_covariance, set_identity, set_minus_cross
+from eskf_ros.filter.measurements.row import NEEDS_LEVEL, OptionalBlock, Row, threefold
+from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, POSITION
 from eskf_ros.geodesy.earth import east_north_up_to_ecef, geodetic_to_ecef
 from eskf_ros.geodesy.rotation import rotate, rotate_back, to_matrix
@@ -86,3 +89,42 @@ def linearize(state, payload, source, settings, work):
     else:
         set_minus_cross(work.jacobian, ATTITUDE, lever)
     return SIZE
+
+
+def limits(gnss: Any) -> dict[str, Any]:
+    """Particulars of the `Intake`; the stand-in for an unknown covariance depends on the status of the fix."""
+    return {
+        "is_used": gnss.use_position,
+        "std_floor": threefold(gnss.position_std_floor),
+        "unknown_std": threefold(math.nan),
+        "largest": math.inf,
+    }
+
+
+def augmented(parameters: Any) -> tuple[OptionalBlock, ...]:
+    """The part of the error of fixes, or of ranges in mode tight, that lasts."""
+    time = parameters.ranges.correlation_time if parameters.mode == "tight" else parameters.gnss.correlation_time
+    return (
+        OptionalBlock(
+            "position_error",
+            is_on=time > 0.0,
+            std=1.0,
+            noise_density=math.sqrt(2.0 / time) if time else 0.0,
+            correlation_time=time,
+            streams=(Stream.GNSS_POSITION,),
+        ),
+    )
+
+
+ROW = Row(
+    Stream.GNSS_POSITION,
+    "GNSS position",
+    group_name="gnss",
+    types=("sensor_msgs/msg/NavSatFix",),
+    limits=limits,
+    depth=50,
+    is_gnss=True,
+    needs=NEEDS_LEVEL,
+    augmented=augmented,
+)
+"""The facts of this measurement."""

@@ -7,9 +7,13 @@ velocity + R (omega x lever_arm), omega the body rate relative to the Earth, fre
 
 from __future__ import annotations
 
+from typing import Any
+
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import body_rate, local_east_north_up_to_ecef
 from eskf_ros.filter.measurements.jacobians import clear, set_east_north_up_covariance, set_identity, set_minus_cross
+from eskf_ros.filter.measurements.row import HIGHEST_SPEED, NEEDS_POSITION, Row, threefold
+from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ATTITUDE, GYRO_BIAS, VELOCITY
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix
 
@@ -64,3 +68,26 @@ def linearize(state, payload, source, settings, work):
         for j in range(3):
             work.jacobian[i, GYRO_BIAS + j] = row[j]
     return SIZE
+
+
+def limits(gnss: Any) -> dict[str, Any]:
+    """Particulars of the `Intake`."""
+    return {
+        "is_used": gnss.use_velocity,
+        "std_floor": threefold(gnss.velocity_std_floor),
+        "unknown_std": threefold(gnss.unknown_velocity_std),
+        "largest": HIGHEST_SPEED,
+    }
+
+
+ROW = Row(
+    Stream.GNSS_VELOCITY,
+    "GNSS velocity",
+    group_name="gnss",
+    types=("geometry_msgs/msg/TwistWithCovarianceStamped", "geometry_msgs/msg/TwistStamped"),
+    limits=limits,
+    depth=50,
+    is_gnss=True,
+    needs=NEEDS_POSITION,
+)
+"""The facts of this measurement."""

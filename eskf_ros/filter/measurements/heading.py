@@ -14,12 +14,29 @@ north. It serves at start only (``heading_hints``).
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import local_east_north_up_to_ecef
 from eskf_ros.filter.measurements.jacobians import azimuth_change, clear, set_attitude_row, to_local
-from eskf_ros.filter.state.error_state import ERROR_SIZE
+from eskf_ros.filter.measurements.row import (
+    NEEDS_POSITION,
+    UNMEASURED,
+    OptionalBlock,
+    Place,
+    Readings,
+    Row,
+    threefold,
+    to_base,
+)
+from eskf_ros.filter.state.enums import Stream
+from eskf_ros.filter.state.error_state import ERROR_SIZE, SOURCES
 from eskf_ros.geodesy.rotation import wrapped
+from eskf_ros.parameters.schema import Aid, parameter
 
 IMU_ORIENTATION = 1
 
@@ -30,7 +47,7 @@ STEEPEST = 0.17
 @njit
 def predict(state, source, settings):
     """Return yaw and pitch (rad) of the line of ``source``."""
-    line = settings.heading_lines_body[source]
+    line = settings.heading.lines_body[source]
     d = to_local(state, local_east_north_up_to_ecef(state), (line[0], line[1], line[2]))
     return math.atan2(d[1], d[0]), math.atan2(-d[2], math.sqrt(d[0] ** 2 + d[1] ** 2))
 
@@ -40,11 +57,11 @@ def linearize(state, payload, source, settings, work):
     """Write innovation, Jacobian and noise of what was measured of yaw and pitch to ``work``; return the size."""
     clear(work)
     yaw = payload[0]
-    if source == IMU_ORIENTATION and settings.is_orientation_magnetic == 1:
+    if source == IMU_ORIENTATION and settings.heading.is_orientation_magnetic == 1:
         if state.mag.field_known == 0:
             return 0
         yaw -= state.mag.declination
-    line = settings.heading_lines_body[source]
+    line = settings.heading.lines_body[source]
     local_to_ecef = local_east_north_up_to_ecef(state)
     d = to_local(state, local_to_ecef, (line[0], line[1], line[2]))
     level_square = d[0] ** 2 + d[1] ** 2
@@ -71,3 +88,121 @@ def linearize(state, payload, source, settings, work):
         work.noise[size, size] = payload[6]
         size += 1
     return size
+
+
+@dataclass(frozen=True)
+class Heading(Aid):
+    mount_rpy_deg: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0),
+        "deg",
+        "Orientation of the baseline in base_link, whose yaw and pitch the messages tell: roll, pitch, yaw about fixed "
+        "axes as in a URDF, of a frame whose x axis leads from the first antenna (of u-blox: the moving base) to the "
+        "second. [0.0, 0.0, 0.0]: the second is in front; [0.0, 0.0, 90.0]: it is on the left; [0.0, 0.0, 180.0]: it "
+        "is behind.",
+        minimum=-360.0,
+        maximum=360.0,
+    )
+    offset_std_deg: float = parameter(
+        0.5,
+        "deg",
+        "Standard deviation at first of what all messages are wrong by alike: how well the baseline is known in "
+        "base_link, and multipath at the antennas. It is estimated as the vehicle accelerates; 0: there is none.",
+        minimum=0.0,
+        maximum=90.0,
+    )
+    offset_random_walk: float = parameter(
+        2.0e-4,
+        "rad/rtHz",
+        "How fast that wanders: by this value times the square root of the seconds passed. The default is 0.36 deg in "
+        "1000 s.",
+        minimum=0.0,
+        maximum=1.0,
+    )
+    std_floor_deg: float = parameter(
+        0.2, "deg", "The standard deviation is never taken smaller than this.", above=0.0, maximum=90.0, live=True
+    )
+    unknown_std_deg: float = parameter(
+        1.0, "deg", "Standard deviation where the message gives none.", above=0.0, maximum=90.0, live=True
+    )
+
+
+SETTINGS = np.dtype([("lines_body", "f8", (SOURCES, 3)), ("is_orientation_magnetic", "i8")], align=True)
+"""Baseline of the dual antenna and x axis of base_link (unit vectors, IMU axes); whether the IMU's own orientation
+counts from magnetic north."""
+
+LARGEST_ANGLE = 2.0 * math.pi
+"""rad; no driver reports a larger yaw or pitch."""
+
+UNKNOWN_ANGLE_VARIANCE = 1.0
+"""rad2; drivers say with a variance like 1000 or pi^2 that they do not know an angle."""
+
+
+def read(messages: npt.NDArray[Any]) -> Readings:
+    """Yaw (0 = east, counter-clockwise) and pitch (down is positive) of an orientation, if there is one (REP-145)."""
+    x, y, z, w = messages["orientation"].T
+    values, covariances = np.zeros((len(messages), 3)), np.zeros((len(messages), 9))
+    values[:, 0] = np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
+    values[:, 1] = np.arcsin(np.clip(2.0 * (w * y - x * z), -1.0, 1.0))
+    given = messages["orientation_covariance"]
+    covariances[:, 0], covariances[:, 4] = given[:, 8], given[:, 4]
+    covariances[given.any(axis=1), 8] = UNMEASURED
+    # Drivers that know the yaw only leave the pitch zero, and its variance.
+    covariances[(given[:, 8] > 0.0) & (given[:, 4] == 0.0), 4] = UNMEASURED
+    covariances[given[:, 0] == UNMEASURED] = UNMEASURED
+    values[np.abs(x * x + y * y + z * z + w * w - 1.0) > 0.1] = math.nan
+    return values, covariances
+
+
+def limits(heading: Heading) -> dict[str, Any]:
+    """Particulars of the `Intake`: angles in rad."""
+    return {
+        "std_floor": threefold(math.radians(heading.std_floor_deg)),
+        # A message without a covariance says nothing of the pitch.
+        "unknown_std": (math.radians(heading.unknown_std_deg), math.nan, math.nan),
+        "largest": LARGEST_ANGLE,
+        "may_lack_axes": True,
+        "largest_variance": UNKNOWN_ANGLE_VARIANCE,
+    }
+
+
+def describe(settings: np.void, parameters: Any) -> None:
+    """Fill in `SETTINGS`."""
+    baseline = to_base(parameters.heading.mount_rpy_deg)[:, 0]
+    settings["lines_body"] = np.array([baseline, (1.0, 0.0, 0.0)]) @ to_base(parameters.imu.mount_rpy_deg)
+    settings["is_orientation_magnetic"] = parameters.alignment.imu_orientation == "magnetic_north"
+
+
+def augmented(parameters: Any) -> tuple[OptionalBlock, ...]:
+    """The constant by which the antennas point otherwise than their mounting angle says."""
+    heading: Heading = parameters.heading
+    return (
+        OptionalBlock(
+            "heading_offset",
+            is_on=heading.offset_std_deg > 0.0,
+            std=math.radians(heading.offset_std_deg),
+            noise_density=heading.offset_random_walk,
+            streams=(Stream.HEADING,),
+        ),
+    )
+
+
+ROW = Row(
+    Stream.HEADING,
+    "dual antenna",
+    Heading,
+    "Heading of a dual-antenna receiver.",
+    types=("sensor_msgs/msg/Imu",),
+    topic="gnss/heading",
+    topic_about="sensor_msgs/Imu of a dual-antenna receiver: yaw (0 = east, counter-clockwise) and pitch of the "
+    "baseline; one whose variance is above 1 rad2 is not used.",
+    read=read,
+    limits=limits,
+    depth=50,
+    is_gnss=True,
+    needs=NEEDS_POSITION,
+    augmented=augmented,
+    place=Place(rotation="heading.mount_rpy_deg", inputs=("heading",)),
+    settings=SETTINGS,
+    describe=describe,
+)
+"""The facts of this measurement."""

@@ -15,15 +15,29 @@ the estimate: they would tell tilt, which the accelerometers know better.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import local_east_north_up_to_ecef
 from eskf_ros.filter.measurements.jacobians import clear, set_attitude_row, to_local
-from eskf_ros.filter.state.enums import Verdict
+from eskf_ros.filter.measurements.row import (
+    NEEDS_FIELD,
+    NEEDS_POSITION,
+    OptionalBlock,
+    Place,
+    Readings,
+    Row,
+    threefold,
+    to_base,
+)
+from eskf_ros.filter.state.enums import Stream, Verdict
 from eskf_ros.filter.state.error_state import ERROR_SIZE
 from eskf_ros.geodesy.rotation import dot, rotate, rotate_back, to_matrix, wrapped
+from eskf_ros.parameters.schema import Aid, parameter
 
 EARTH_FIELD = np.dtype(
     [
@@ -68,7 +82,7 @@ def earth_field_body(state, payload, settings):
     if place < state.error_size:
         b = state.optional[place - ERROR_SIZE : place - ERROR_SIZE + 3]
         m = (m[0] - b[0], m[1] - b[1], m[2] - b[2])
-    return rotate(settings.mag_to_imu, m)
+    return rotate(settings.mag.sensor_to_imu, m)
 
 
 @njit
@@ -102,7 +116,7 @@ def linearize(state, payload, settings, work):
     # How the angle changes with the reading: first in local axes, then in map, body, and the axes of the sensor.
     change = (-north / level, east / level, 0.0)
     change = rotate_back(state.frame.map_to_ecef, rotate(local_to_ecef, change))
-    change = rotate_back(settings.mag_to_imu, rotate_back(to_matrix(state.attitude), change))
+    change = rotate_back(settings.mag.sensor_to_imu, rotate_back(to_matrix(state.attitude), change))
     xx, xy, xz, yy, yz, zz = payload[3], payload[4], payload[5], payload[6], payload[7], payload[8]
     spread = rotate(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)), change)
     work.noise[0, 0] = dot(change, spread)
@@ -132,8 +146,8 @@ def update_disturbance(state, aid, settings):
             doubt = max(doubt, state.covariance[place + i, place + i])
     doubt = SIGMAS * math.sqrt(doubt) / state.mag.strength
     if (
-        abs(strength / state.mag.strength - 1.0) > settings.mag_strength_tolerance + doubt
-        or abs(inclination - state.mag.inclination) > settings.mag_inclination_tolerance + doubt
+        abs(strength / state.mag.strength - 1.0) > settings.mag.strength_tolerance + doubt
+        or abs(inclination - state.mag.inclination) > settings.mag.inclination_tolerance + doubt
     ):
         state.mag.disturbed_stamp = aid.stamp
     return aid.stamp - state.mag.disturbed_stamp < HOLD
@@ -150,7 +164,7 @@ def propagate_mag_error(state, heading, settings):
     i = settings.mag_error_at
     p, last = state.position_map, state.mag.position
     distance = math.sqrt((p[0] - last[0]) ** 2 + (p[1] - last[1]) ** 2 + (p[2] - last[2]) ** 2)
-    way = distance / settings.mag_error_distance + abs(wrapped(heading - state.mag.heading)) / TURN
+    way = distance / settings.mag.error_distance + abs(wrapped(heading - state.mag.heading)) / TURN
     if way < STEP:
         return
     fading = math.exp(-way)
@@ -173,3 +187,149 @@ def note_field(state, aid, place):
         state.mag.inclination = aid.payload[place + 2]
         state.mag.strength = aid.payload[place + 3]
         state.mag.field_known = 1
+
+
+@dataclass(frozen=True)
+class Mag(Aid):
+    use: bool = parameter(
+        False,
+        "",
+        "Fuse the heading that the magnetometer shows. Off unless asked for: in vehicles, indoors and near iron it "
+        "misleads.",
+        live=True,
+    )
+    mount_rpy_deg: tuple[float, ...] = parameter(
+        (),
+        "deg",
+        "Orientation of the magnetometer in base_link: roll, pitch, yaw about fixed axes as in a URDF. "
+        "Empty: its axes are those of the IMU.",
+        lengths=(0, 3),
+        minimum=-360.0,
+        maximum=360.0,
+    )
+    declination_deg: float = parameter(
+        math.nan,
+        "deg",
+        "Angle from true north to magnetic north, east positive. .nan: from the World Magnetic Model for the place of "
+        "the fixes and the date of their stamps, for which the Python package pygeomag must be installed.",
+        minimum=-180.0,
+        maximum=180.0,
+        nan_allowed=True,
+    )
+    error_std_deg: float = parameter(
+        4.0,
+        "deg",
+        "Standard deviation of the heading error that remains after calibration, by iron in the vehicle and nearby. It "
+        "does not average out while the vehicle stands.",
+        above=0.0,
+        maximum=180.0,
+    )
+    error_distance: float = parameter(
+        50.0,
+        "m",
+        "Having travelled so far, or turned by one radian, the vehicle meets another such error.",
+        above=0.0,
+        maximum=1.0e6,
+    )
+    strength_tolerance: float = parameter(
+        0.15,
+        "",
+        "A field is taken for disturbed where its strength differs by more than this part from that of the World "
+        "Magnetic Model. Without the model nothing is checked.",
+        above=0.0,
+        maximum=10.0,
+        live=True,
+    )
+    inclination_tolerance_deg: float = parameter(
+        8.0,
+        "deg",
+        "The same for its inclination (dip).",
+        above=0.0,
+        maximum=180.0,
+        live=True,
+    )
+    std_floor: float = parameter(
+        1.0e-6,
+        "T",
+        "The standard deviation per axis is never taken smaller than this.",
+        above=0.0,
+        maximum=1.0,
+        live=True,
+    )
+    unknown_std: float = parameter(
+        1.0e-6, "T", "Standard deviation per axis where the message gives none.", above=0.0, maximum=1.0, live=True
+    )
+
+
+SETTINGS = np.dtype(
+    [
+        ("sensor_to_imu", "f8", (3, 3)),
+        ("strength_tolerance", "f8"),
+        ("inclination_tolerance", "f8"),
+        ("error_distance", "f8"),
+    ],
+    align=True,
+)
+"""Rotation from the axes of the magnetometer to those of the IMU; share of the strength and angle (rad) by which a
+field may differ from the Earth's; way (m) after which its error is another."""
+
+STRONGEST_FIELD = 1.0
+"""T; no magnetometer on a robot reports more."""
+
+
+def read(messages: npt.NDArray[Any]) -> Readings:
+    """Field (T) in the axes of the magnetometer."""
+    return messages["magnetic_field"], messages["magnetic_field_covariance"]
+
+
+def limits(mag: Mag) -> dict[str, Any]:
+    """Particulars of the `Intake`."""
+    return {
+        "std_floor": threefold(mag.std_floor),
+        "unknown_std": threefold(mag.unknown_std),
+        "largest": STRONGEST_FIELD,
+    }
+
+
+def describe(settings: np.void, parameters: Any) -> None:
+    """Fill in `SETTINGS`."""
+    mag: Mag = parameters.mag
+    imu_to_base = to_base(parameters.imu.mount_rpy_deg)
+    mag_to_base = to_base(mag.mount_rpy_deg) if mag.mount_rpy_deg else imu_to_base
+    settings["sensor_to_imu"] = imu_to_base.T @ mag_to_base
+    settings["strength_tolerance"] = mag.strength_tolerance
+    settings["inclination_tolerance"] = math.radians(mag.inclination_tolerance_deg)
+    settings["error_distance"] = mag.error_distance
+
+
+def augmented(parameters: Any) -> tuple[OptionalBlock, ...]:
+    """Disturbances on the way, and the field of the vehicle itself.
+
+    Not by whether the sensor is used, which may change while running: places stay.
+    """
+    mag, estimate = parameters.mag, parameters.estimate
+    return (
+        OptionalBlock("mag_error", is_on=True, std=math.radians(mag.error_std_deg), streams=(Stream.MAG,)),
+        OptionalBlock(
+            "magnetic_bias", is_on=estimate.magnetic_bias, std=estimate.magnetic_bias_std, streams=(Stream.MAG,)
+        ),
+    )
+
+
+ROW = Row(
+    Stream.MAG,
+    "magnetometer",
+    Mag,
+    "Magnetometer.",
+    types=("sensor_msgs/msg/MagneticField",),
+    topic="imu/mag",
+    topic_about="sensor_msgs/MagneticField: field in the axes of the magnetometer.",
+    read=read,
+    limits=limits,
+    needs=NEEDS_POSITION | NEEDS_FIELD,
+    augmented=augmented,
+    place=Place(rotation="mag.mount_rpy_deg", inputs=("mag",)),
+    settings=SETTINGS,
+    describe=describe,
+)
+"""The facts of this measurement."""

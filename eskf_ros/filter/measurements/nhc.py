@@ -15,6 +15,10 @@ is new every second.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import body_rate
@@ -28,10 +32,14 @@ from eskf_ros.filter.measurements.jacobians import (
     set_point_velocity_row,
     vehicle_axes,
 )
+from eskf_ros.filter.measurements.row import Row, arm_body
+from eskf_ros.filter.measurements.zupt import CONSTRAINT_GATE_PROBABILITY
+from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ATTITUDE
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity.detector import has_block, mean_force
 from eskf_ros.geodesy.rotation import cross, dot, to_matrix
+from eskf_ros.parameters.schema import parameter
 
 SIZE = 2
 
@@ -48,7 +56,7 @@ def predict(state, settings):
     """Return the lateral and the vertical velocity (m/s) of the point."""
     rotation = to_matrix(state.attitude)
     _forward, left, up = vehicle_axes(state, settings)
-    velocity = point_velocity(state, rotation, body_rate(state, rotation), settings.nhc_arm_body)
+    velocity = point_velocity(state, rotation, body_rate(state, rotation), settings.nhc.arm_body)
     return dot(left, velocity), dot(up, velocity)
 
 
@@ -65,7 +73,7 @@ def linearize(state, settings, work):
         return 0
     clear(work)
     rotation = to_matrix(state.attitude)
-    arm = settings.nhc_arm_body
+    arm = settings.nhc.arm_body
     forward, left, up = vehicle_axes(state, settings)
     speed = dot(forward, point_velocity(state, rotation, body_rate(state, rotation), arm))
     sideways, upwards = predict(state, settings)
@@ -79,17 +87,111 @@ def linearize(state, settings, work):
     set_mounting(work.jacobian, 0, -cosine * speed - sine * upwards, 0.0, state, settings)
     set_mounting(work.jacobian, 1, sine * sideways, speed, state, settings)
 
-    slip = settings.nhc_slip * horizontal_acceleration(state, rotation, mean_force(state))
-    angle_variance = settings.nhc_angle_std**2 + slip**2
+    slip = settings.nhc.slip * horizontal_acceleration(state, rotation, mean_force(state))
+    angle_variance = settings.nhc.angle_std**2 + slip**2
     loosening = 1.0
     if state.rest.slip_stamp != NEVER and state.stamp - state.rest.slip_stamp <= SLIP_MEMORY:
         loosening = SLIPPING**2
     rate_variance = gyro_noise_variance(state, settings)
     left_lever, up_lever = cross(left, arm), cross(up, arm)
-    work.noise[0, 0] = loosening * (settings.nhc_lateral_std**2 + angle_variance * speed**2)
-    work.noise[1, 1] = loosening * (settings.nhc_vertical_std**2 + angle_variance * speed**2)
+    work.noise[0, 0] = loosening * (settings.nhc.lateral_std**2 + angle_variance * speed**2)
+    work.noise[1, 1] = loosening * (settings.nhc.vertical_std**2 + angle_variance * speed**2)
     work.noise[0, 0] += rate_variance * dot(left_lever, left_lever)
     work.noise[1, 1] += rate_variance * dot(up_lever, up_lever)
     work.noise[0, 1] = rate_variance * dot(left_lever, up_lever)
     work.noise[1, 0] = work.noise[0, 1]
     return SIZE
+
+
+@dataclass(frozen=True)
+class Nhc:
+    enabled: bool = parameter(
+        False,
+        "",
+        "For vehicles on wheels: they move neither sideways nor up and down at the rear axle (non-holonomic "
+        "constraint).",
+        live=True,
+    )
+    position: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0),
+        "m",
+        "The point of base_link that does not move sideways: the middle of the axle that does not steer, usually the "
+        "rear one.",
+        minimum=-1000.0,
+        maximum=1000.0,
+    )
+    lateral_std: float = parameter(
+        0.05,
+        "m/s",
+        "Standard deviation of the lateral velocity, however slow the vehicle is.",
+        above=0.0,
+        maximum=100.0,
+        live=True,
+    )
+    vertical_std: float = parameter(
+        0.1,
+        "m/s",
+        "The same of the vertical velocity: bumps and springs.",
+        above=0.0,
+        maximum=100.0,
+        live=True,
+    )
+    angle_std_deg: float = parameter(
+        0.3,
+        "deg",
+        "How far the direction of travel differs from the axes of the vehicle on a straight road (camber, side wind), "
+        "as a standard deviation.",
+        minimum=0.0,
+        maximum=90.0,
+        live=True,
+    )
+    slip: float = parameter(
+        0.01,
+        "rad s2/m",
+        "What acceleration adds to this angle, by side slip of the tyres in turns, and by springs, for every m/s2. The "
+        "default is about twice what a car shows, because these errors last for seconds.",
+        minimum=0.0,
+        maximum=1.0,
+        live=True,
+    )
+
+
+SETTINGS = np.dtype(
+    [
+        ("arm_body", "f8", (3,)),
+        ("lateral_std", "f8"),
+        ("vertical_std", "f8"),
+        ("angle_std", "f8"),
+        ("slip", "f8"),
+    ],
+    align=True,
+)
+"""The point that does not slide (m from the IMU, in its axes), and how true the constraint is: see `Nhc`."""
+
+
+def describe(settings: np.void, parameters: Any) -> None:
+    """Fill in `SETTINGS`."""
+    nhc: Nhc = parameters.nhc
+    settings["arm_body"] = arm_body(nhc.position, parameters)
+    settings["lateral_std"] = nhc.lateral_std
+    settings["vertical_std"] = nhc.vertical_std
+    settings["angle_std"] = math.radians(nhc.angle_std_deg)
+    settings["slip"] = nhc.slip
+
+
+def is_enabled(parameters: Any) -> bool:
+    """Say whether the constraint is switched on."""
+    return bool(parameters.nhc.enabled)
+
+
+ROW = Row(
+    Stream.NHC,
+    "non-holonomic constraint",
+    Nhc,
+    "Non-holonomic constraint.",
+    gate_probability=CONSTRAINT_GATE_PROBABILITY,
+    settings=SETTINGS,
+    describe=describe,
+    is_enabled=is_enabled,
+)
+"""The facts of this measurement."""

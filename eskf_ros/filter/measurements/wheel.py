@@ -14,6 +14,11 @@ error that lasts for T s and comes with every message, dt s apart, does as much 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import body_rate
@@ -27,9 +32,20 @@ from eskf_ros.filter.measurements.jacobians import (
     set_point_velocity_row,
     vehicle_axes,
 )
+from eskf_ros.filter.measurements.row import (
+    HIGHEST_SPEED,
+    UNMEASURED,
+    OptionalBlock,
+    Readings,
+    Row,
+    arm_body,
+    twist_covariances,
+)
+from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, GYRO_BIAS
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.geodesy.rotation import cross, dot, rotate, to_matrix
+from eskf_ros.parameters.schema import Aid, parameter
 
 LASTING_SPEED_ERROR = 0.001
 """Share of the speed by which it is wrong for a while, even when no force is on the tyres."""
@@ -64,7 +80,7 @@ def predict(state, settings):
     rotation = to_matrix(state.attitude)
     rate = body_rate(state, rotation)
     forward, _left, up = vehicle_axes(state, settings)
-    velocity = point_velocity(state, rotation, rate, settings.wheel_arm_body)
+    velocity = point_velocity(state, rotation, rate, settings.wheel.arm_body)
     return scale_of(state, settings) * dot(forward, velocity), dot(up, rate)
 
 
@@ -83,7 +99,7 @@ def linearize(state, payload, settings, work):
     clear(work)
     rotation = to_matrix(state.attitude)
     rate = body_rate(state, rotation)
-    arm = settings.wheel_arm_body
+    arm = settings.wheel.arm_body
     forward, left, up = vehicle_axes(state, settings)
     velocity = point_velocity(state, rotation, rate, arm)
     speed, scale = dot(forward, velocity), scale_of(state, settings)
@@ -102,7 +118,7 @@ def linearize(state, payload, settings, work):
         if settings.wheel_scale_at < state.error_size:
             work.jacobian[0, settings.wheel_scale_at] = speed
         acceleration = horizontal_acceleration(state, rotation, state.specific_force)
-        slip = speed * (LASTING_SPEED_ERROR + settings.wheel_slip * acceleration)
+        slip = speed * (LASTING_SPEED_ERROR + settings.wheel.slip * acceleration)
         work.noise[0, 0] = payload[3] + repeated(state, SLIP_TIME) * slip**2 + rate_variance * dot(lever, lever)
         size = 1
     if payload[6] >= 0.0:
@@ -121,3 +137,125 @@ def linearize(state, payload, settings, work):
             work.noise[1, 0] = shared
         size += 1
     return size
+
+
+@dataclass(frozen=True)
+class Wheel(Aid):
+    position: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0),
+        "m",
+        "The point of base_link whose forward speed the wheels show: the middle of the axle they are on, or the place "
+        "of a single wheel.",
+        minimum=-1000.0,
+        maximum=1000.0,
+    )
+    slip: float = parameter(
+        0.005,
+        "s2/m",
+        "Tyres slip by this share of the speed for every m/s2 of acceleration. The default is that of a car on dry "
+        "asphalt; loose ground takes several times as much.",
+        minimum=0.0,
+        maximum=1.0,
+        live=True,
+    )
+    speed_std_floor: float = parameter(
+        0.05,
+        "m/s",
+        "The standard deviation of the speed is never taken smaller than this.",
+        above=0.0,
+        maximum=100.0,
+        live=True,
+    )
+    yaw_rate_std_floor: float = parameter(
+        0.02,
+        "rad/s",
+        "The standard deviation of the yaw rate is never taken smaller than this.",
+        above=0.0,
+        maximum=10.0,
+        live=True,
+    )
+    unknown_speed_std: float = parameter(
+        0.1, "m/s", "Standard deviation of the speed where the message gives none.", above=0.0, maximum=100.0, live=True
+    )
+    unknown_yaw_rate_std: float = parameter(
+        0.1,
+        "rad/s",
+        "Standard deviation of the yaw rate where the message gives none.",
+        above=0.0,
+        maximum=10.0,
+        live=True,
+    )
+
+
+SETTINGS = np.dtype([("arm_body", "f8", (3,)), ("slip", "f8")], align=True)
+"""Where the wheels measure (m from the IMU, in its axes); share of the speed by which tyres slip per m/s2."""
+
+TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
+BARE_TWIST = "geometry_msgs/msg/TwistStamped"
+ODOMETRY = "nav_msgs/msg/Odometry"
+
+
+def read(messages: npt.NDArray[Any]) -> Readings:
+    """Speed along x (m/s) and yaw rate (rad/s) of a twist; the third axis is absent."""
+    values, covariances = np.zeros((len(messages), 3)), np.zeros((len(messages), 9))
+    values[:, 0] = messages["linear_velocity"][:, 0]
+    values[:, 1] = messages["angular_velocity"][:, 2]
+    of_both = twist_covariances(messages)[:, [0, 0, 5, 5], [0, 5, 0, 5]]
+    covariances[:, [0, 1, 3, 4]] = of_both
+    # All zero stays all zero: unknown.
+    covariances[of_both.any(axis=1), 8] = UNMEASURED
+    return values, covariances
+
+
+def limits(wheel: Wheel) -> dict[str, Any]:
+    """Particulars of the `Intake`."""
+    return {
+        "std_floor": (wheel.speed_std_floor, wheel.yaw_rate_std_floor, 1.0),
+        "unknown_std": (wheel.unknown_speed_std, wheel.unknown_yaw_rate_std, 1.0),
+        "largest": HIGHEST_SPEED,
+        "may_lack_axes": True,
+    }
+
+
+def describe(settings: np.void, parameters: Any) -> None:
+    """Fill in `SETTINGS`."""
+    settings["arm_body"] = arm_body(parameters.wheel.position, parameters)
+    settings["slip"] = parameters.wheel.slip
+
+
+def augmented(parameters: Any) -> tuple[OptionalBlock, ...]:
+    """Axes of the vehicle in base_link, which the constraint of its wheels needs too, and the scale of the speed."""
+    estimate = parameters.estimate
+    return (
+        OptionalBlock(
+            "mounting",
+            is_on=estimate.mounting,
+            std=math.radians(estimate.mounting_std_deg),
+            noise_density=estimate.mounting_random_walk,
+            streams=(Stream.NHC, Stream.WHEEL),
+        ),
+        OptionalBlock(
+            "wheel_scale",
+            is_on=estimate.wheel_scale,
+            std=estimate.wheel_scale_std,
+            noise_density=estimate.wheel_scale_random_walk,
+            streams=(Stream.WHEEL,),
+        ),
+    )
+
+
+ROW = Row(
+    Stream.WHEEL,
+    "wheel odometry",
+    Wheel,
+    "Wheel odometry.",
+    types=(ODOMETRY, TWIST, BARE_TWIST),
+    topic="wheel/odom",
+    topic_about="nav_msgs/Odometry: wheel odometry, of which speed and yaw rate are used.",
+    read=read,
+    limits=limits,
+    augmented=augmented,
+    settings=SETTINGS,
+    describe=describe,
+)
+"""The facts of this measurement."""

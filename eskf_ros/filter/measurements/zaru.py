@@ -15,7 +15,9 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.measurements.jacobians import clear, set_identity
-from eskf_ros.filter.state.enums import CONSTRAINT_INTERVAL
+from eskf_ros.filter.measurements.row import Row
+from eskf_ros.filter.measurements.zupt import CONSTRAINT_GATE_PROBABILITY, is_enabled
+from eskf_ros.filter.state.enums import CONSTRAINT_INTERVAL, Stream
 from eskf_ros.filter.state.error_state import ATTITUDE, GYRO_BIAS
 from eskf_ros.filter.stationarity.detector import is_resting, mean_rate
 from eskf_ros.geodesy.rotation import cross, rotate_back, to_matrix
@@ -60,7 +62,7 @@ def linearize(state, settings, work):
     set_identity(work.jacobian, GYRO_BIAS)
     for i in range(SIZE):
         work.innovation[i] = measured[i] - predicted[i]
-        work.noise[i, i] = density**2 / INTERVAL + settings.zupt_rate_std**2
+        work.noise[i, i] = density**2 / INTERVAL + settings.zupt.rate_std**2
         axis = (rotation[0][i], rotation[1][i], rotation[2][i])
         earth = cross(axis, state.frame.earth_rate_map)
         for j in range(3):
@@ -68,3 +70,13 @@ def linearize(state, settings, work):
             # The attitude has turned by R times the noise, and lags by it: the covariance of noise i and error j.
             work.shared[i, ATTITUDE + j] = -axis[j] * shared
     return SIZE
+
+
+ROW = Row(
+    Stream.ZARU,
+    "zero angular rate",
+    group_name="zupt",
+    gate_probability=CONSTRAINT_GATE_PROBABILITY,
+    is_enabled=is_enabled,
+)
+"""The facts of this measurement; its parameters and settings are those of the zero velocity."""

@@ -7,10 +7,18 @@ it is new every time; ten zeros in a second would be believed ten times.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
 from eskf_ros.compiled import njit
 from eskf_ros.filter.measurements.jacobians import clear, set_identity
+from eskf_ros.filter.measurements.row import Row
+from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import VELOCITY
 from eskf_ros.filter.stationarity.detector import is_resting
+from eskf_ros.parameters.schema import parameter
 
 SIZE = 3
 
@@ -24,5 +32,63 @@ def linearize(state, settings, work):
     set_identity(work.jacobian, VELOCITY)
     for i in range(SIZE):
         work.innovation[i] = -state.velocity_map[i]
-        work.noise[i, i] = settings.zupt_velocity_std**2
+        work.noise[i, i] = settings.zupt.velocity_std**2
     return SIZE
+
+
+@dataclass(frozen=True)
+class Zupt:
+    enabled: bool = parameter(
+        True,
+        "",
+        "While the vehicle stands still, hold velocity and turn rate at zero. Wheels, GNSS and the spread of the IMU's "
+        "readings tell when it does.",
+        live=True,
+    )
+    velocity_std: float = parameter(
+        0.02,
+        "m/s",
+        "Standard deviation of the velocity of a vehicle that stands: it sways on its springs.",
+        above=0.0,
+        maximum=10.0,
+        live=True,
+    )
+    rate_std: float = parameter(
+        1.0e-4,
+        "rad/s",
+        "Standard deviation of its turn rate, as a mean over one second.",
+        above=0.0,
+        maximum=1.0,
+        live=True,
+    )
+
+
+CONSTRAINT_GATE_PROBABILITY = 0.999
+"""Share of the constraints that passes their chi-square gate where they hold."""
+
+SETTINGS = np.dtype([("velocity_std", "f8"), ("rate_std", "f8")], align=True)
+"""How fast a body sways (m/s) and turns (rad/s) at rest."""
+
+
+def describe(settings: np.void, parameters: Any) -> None:
+    """Fill in `SETTINGS`."""
+    settings["velocity_std"] = parameters.zupt.velocity_std
+    settings["rate_std"] = parameters.zupt.rate_std
+
+
+def is_enabled(parameters: Any) -> bool:
+    """Say whether the constraints at rest are switched on."""
+    return bool(parameters.zupt.enabled)
+
+
+ROW = Row(
+    Stream.ZUPT,
+    "zero velocity",
+    Zupt,
+    "Standing still.",
+    gate_probability=CONSTRAINT_GATE_PROBABILITY,
+    settings=SETTINGS,
+    describe=describe,
+    is_enabled=is_enabled,
+)
+"""The facts of this measurement."""

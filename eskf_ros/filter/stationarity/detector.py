@@ -185,7 +185,7 @@ def is_steady(state, settings):
     mean accelerations.
     """
     half = 0.5e-9 * CONSTRAINT_INTERVAL
-    sway = 6.0 * (settings.zupt_velocity_std / half) ** 2
+    sway = 6.0 * (settings.zupt.velocity_std / half) ** 2
     first, second = state.rest.block_half_count, state.rest.block_count - state.rest.block_half_count
     for i in range(6):
         change = (state.rest.block_sum[i] - state.rest.block_half_sum[i]) / second - state.rest.block_half_sum[
@@ -194,7 +194,7 @@ def is_steady(state, settings):
         if i < 3:
             variance = 2.0 * settings.accel_noise_density**2 / half + sway
         else:
-            variance = 2.0 * settings.gyro_noise_density**2 / half + 4.0 * settings.zupt_rate_std**2
+            variance = 2.0 * settings.gyro_noise_density**2 / half + 4.0 * settings.zupt.rate_std**2
         if change * change > STEADY_SIGMAS**2 * variance:
             return False
     return True

@@ -13,11 +13,14 @@ Gauss-Markov). Vertically more than horizontally: what the models leave of the a
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.measurements.jacobians import clear
+from eskf_ros.filter.measurements.row import OptionalBlock, Row
+from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, INTER_SYSTEM, NOWHERE, POSITION
 from eskf_ros.filter.tight.signal import (
     CARRIER,
@@ -28,6 +31,7 @@ from eskf_ros.filter.tight.signal import (
     MEASURED,
     NOISE_FACTOR,
     STD,
+    Ranges,
     antenna_ecef,
     clock_bias,
     satellite_of,
@@ -41,7 +45,7 @@ from eskf_ros.gnss.atmosphere import ionosphere_scale, klobuchar, troposphere
 from eskf_ros.gnss.geometry import elevation_azimuth
 from eskf_ros.gnss.range_model import UNMODELLED_IONOSPHERE
 from eskf_ros.gnss.ranges import IONOSPHERE_APPLIED, TROPOSPHERE_APPLIED
-from eskf_ros.gnss.signals import GNSS_COUNT, L1
+from eskf_ros.gnss.signals import GNSS_COUNT, L1, Gnss
 from eskf_ros.gnss.time import SECONDS_PER_WEEK
 from eskf_ros.gnss.weighting import DEFAULT_WEIGHTING, code_std
 
@@ -94,7 +98,7 @@ def predict(state, payload, source, settings):
     place = settings.position_error_at
     if place < state.error_size:
         for i in range(3):
-            pseudorange -= unit[i] * settings.range_error_std[i] * state.optional[place - ERROR_SIZE + i]
+            pseudorange -= unit[i] * settings.pseudorange.error_std[i] * state.optional[place - ERROR_SIZE + i]
     return pseudorange, unit, elevation, ionosphere
 
 
@@ -109,14 +113,14 @@ def variance(payload, source, elevation, ionosphere, settings):
             modelled, unmodelled = 0.0, UNMODELLED_IONOSPHERE / max(0.3, math.sin(elevation))
         std = code_std(DEFAULT_WEIGHTING, gnss_id, sv_id, elevation, payload[CN0], modelled, payload[NOISE_FACTOR])
         square = std * std + unmodelled * unmodelled
-    return max(settings.range_covariance_scale * square, settings.code_std_floor**2)
+    return max(settings.pseudorange.covariance_scale * square, settings.pseudorange.code_std_floor**2)
 
 
 @njit
 def linearize(state, payload, source, settings, work):
     """Write innovation, Jacobian and noise of one pseudorange to ``work``; return 1, or 0 below the elevation mask."""
     predicted, unit, elevation, ionosphere = predict(state, payload, source, settings)
-    if not elevation >= settings.elevation_mask:
+    if not elevation >= settings.pseudorange.elevation_mask:
         return 0
     clear(work)
     work.innovation[0] = payload[MEASURED] - predicted
@@ -137,5 +141,70 @@ def linearize(state, payload, source, settings, work):
     place = settings.position_error_at
     if place < state.error_size:
         for i in range(3):
-            work.jacobian[0, place + i] = -unit[i] * settings.range_error_std[i]
+            work.jacobian[0, place + i] = -unit[i] * settings.pseudorange.error_std[i]
     return SIZE
+
+
+SETTINGS = np.dtype(
+    [
+        ("elevation_mask", "f8"),
+        ("covariance_scale", "f8"),
+        ("code_std_floor", "f8"),
+        ("range_rate_std_floor", "f8"),
+        ("error_std", "f8", (3,)),
+    ],
+    align=True,
+)
+"""Lowest elevation (rad), factor on variances, floors (m, m/s), and what lasts in the errors of the ranges (m, map)."""
+
+START_CLOCK_STD = (1000.0, 1000.0)
+"""Of a receiver clock (m, m/s) whose first value is the median of the satellites."""
+
+
+def describe(settings: np.void, parameters: Any) -> None:
+    """Fill in `SETTINGS`."""
+    ranges: Ranges = parameters.ranges
+    settings["elevation_mask"] = math.radians(ranges.elevation_mask_deg)
+    settings["covariance_scale"] = ranges.covariance_scale
+    settings["code_std_floor"] = ranges.code_std_floor
+    settings["range_rate_std_floor"] = ranges.range_rate_std_floor
+    horizontal, vertical = ranges.correlated_std, ranges.correlated_std_vertical
+    settings["error_std"] = (horizontal, horizontal, vertical)
+
+
+def augmented(parameters: Any) -> tuple[OptionalBlock, ...]:
+    """The clock of the receiver, and the offsets of the constellations, which join with the first signal of each."""
+    ranges: Ranges = parameters.ranges
+    is_tight = parameters.mode == "tight"
+    return (
+        OptionalBlock(
+            "clock",
+            is_on=is_tight,
+            std=START_CLOCK_STD,
+            noise_density=(ranges.clock_bias_noise, ranges.clock_drift_noise),
+            streams=(Stream.PSEUDORANGE, Stream.RANGE_RATE),
+        ),
+        OptionalBlock(
+            "inter_system",
+            is_on=is_tight,
+            std=tuple(
+                ranges.inter_system_std_glonass if system == Gnss.GLONASS else ranges.inter_system_std
+                for system in INTER_SYSTEM
+            ),
+            noise_density=ranges.inter_system_noise,
+        ),
+    )
+
+
+ROW = Row(
+    Stream.PSEUDORANGE,
+    "pseudoranges",
+    Ranges,
+    "What a GNSS receiver measures of each satellite: pseudorange and Doppler.",
+    group_name="ranges",
+    is_gnss=True,
+    augmented=augmented,
+    settings=SETTINGS,
+    describe=describe,
+)
+"""The facts of this measurement."""

@@ -14,6 +14,8 @@ import math
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import body_rate
 from eskf_ros.filter.measurements.jacobians import clear
+from eskf_ros.filter.measurements.row import Row
+from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ATTITUDE, GYRO_BIAS, POSITION, VELOCITY
 from eskf_ros.filter.tight.signal import (
     CN0,
@@ -60,14 +62,14 @@ def variance(payload, settings):
     std = payload[STD]
     if math.isnan(std):
         std = doppler_std(DEFAULT_WEIGHTING, payload[CN0])
-    return max(settings.range_covariance_scale * std * std, settings.range_rate_std_floor**2)
+    return max(settings.pseudorange.covariance_scale * std * std, settings.pseudorange.range_rate_std_floor**2)
 
 
 @njit
 def linearize(state, payload, settings, work):
     """Write innovation, Jacobian and noise of one range rate to ``work``; return 1, or 0 below the elevation mask."""
     predicted, unit, elevation, turning = predict(state, payload, settings)
-    if not elevation >= settings.elevation_mask:
+    if not elevation >= settings.pseudorange.elevation_mask:
         return 0
     clear(work)
     work.innovation[0] = payload[MEASURED] - predicted
@@ -98,3 +100,7 @@ def linearize(state, payload, settings, work):
         work.jacobian[0, ATTITUDE + i] = swayed[i] + moved[i] - along * lever[i] + aligned * unit[i]
         work.jacobian[0, GYRO_BIAS + i] = -turned[i]
     return SIZE
+
+
+ROW = Row(Stream.RANGE_RATE, "range rates", group_name="ranges", is_gnss=True)
+"""The facts of this measurement; its parameters and settings are those of the pseudoranges."""

@@ -8,6 +8,8 @@ out), its standard deviation (NaN: by model), satellite position and velocity (E
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import body_rate
 from eskf_ros.filter.state.error_state import ERROR_SIZE
@@ -15,6 +17,7 @@ from eskf_ros.geodesy.rotation import cross, rotate, rotate_back, to_matrix
 from eskf_ros.gnss.geometry import line_of_sight
 from eskf_ros.gnss.ranges import ALREADY_TURNED
 from eskf_ros.gnss.signals import LETTERS, SIGNALS, time_group
+from eskf_ros.parameters.schema import Aid, parameter
 
 MEASURED = 0
 STD = 1
@@ -101,3 +104,126 @@ def see(payload, position, velocity):
 def to_map(state, vector_ecef):
     """Return a vector in map axes."""
     return rotate_back(state.frame.map_to_ecef, vector_ecef)
+
+
+@dataclass(frozen=True)
+class Ranges(Aid):
+    use: bool = parameter(
+        True,
+        "",
+        "Fuse the pseudoranges of topics.ranges in mode tight.",
+        live=True,
+    )
+    use_doppler: bool = parameter(True, "", "Fuse the Doppler of topics.ranges in mode tight.", live=True)
+    time_offset: float = parameter(
+        0.0,
+        "s",
+        "Added to the stamps: true time = stamp + offset. RINEX files are stamped with UTC: -18 or 18 s may be missing "
+        "where a recording is stamped with GPS time.",
+        minimum=-100.0,
+        maximum=100.0,
+    )
+    gate_probability: float = parameter(
+        0.99994,
+        "",
+        "Gate of each signal: the share of good measurements that passes; 0.99994 is four standard deviations. From "
+        "2.5 on they are weighed down.",
+        above=0.0,
+        below=1.0,
+        live=True,
+    )
+    code_std_floor: float = parameter(
+        0.3,
+        "m",
+        "The standard deviation of a pseudorange is never taken smaller than this.",
+        above=0.0,
+        maximum=1000.0,
+        live=True,
+    )
+    range_rate_std_floor: float = parameter(
+        0.03,
+        "m/s",
+        "The standard deviation of a range rate (Doppler) is never taken smaller than this.",
+        above=0.0,
+        maximum=100.0,
+        live=True,
+    )
+    elevation_mask_deg: float = parameter(
+        10.0, "deg", "Satellites below this elevation are not used.", minimum=-90.0, maximum=90.0, live=True
+    )
+    cn0_mask: float = parameter(
+        28.0,
+        "dB-Hz",
+        "Signals whose carrier-to-noise density is below this are not used; an unknown one passes.",
+        minimum=0.0,
+        maximum=60.0,
+        live=True,
+    )
+    clock_drift_noise: float = parameter(
+        0.3,
+        "m/s/rts",
+        "How fast the drift of the receiver's clock wanders: by this value times the square root of the seconds "
+        "passed. 0.1 geodetic receiver, 0.3 usual, 0.6 hand-held or shaken. Too small makes one or two satellites "
+        "worse than none.",
+        minimum=0.0,
+        maximum=1.0e3,
+        live=True,
+    )
+    clock_bias_noise: float = parameter(
+        0.1,
+        "m/rts",
+        "How fast the bias of the receiver's clock wanders besides its drift.",
+        minimum=0.0,
+        maximum=1.0e3,
+        live=True,
+    )
+    correlation_time: float = parameter(
+        120.0,
+        "s",
+        "How long the common error of the pseudoranges lasts (e-folding time): reflections, orbits, what the models "
+        "leave of the atmosphere. 0: not modelled, and the estimate then trusts the mean of many epochs too much.",
+        minimum=0.0,
+        maximum=1.0e5,
+    )
+    correlated_std: float = parameter(
+        1.5,
+        "m",
+        "With a correlation_time: the standard deviation of a position by errors that last, per horizontal axis ...",
+        above=0.0,
+        maximum=1000.0,
+        live=True,
+    )
+    correlated_std_vertical: float = parameter(
+        3.0,
+        "m",
+        "... and vertically, where the atmosphere is not averaged out. More without parameters of the ionosphere for "
+        "the day (5 m): the stand-in may be wrong by its own size.",
+        above=0.0,
+        maximum=1000.0,
+        live=True,
+    )
+    inter_system_std: float = parameter(
+        10.0,
+        "m",
+        "Standard deviation of the offset between a constellation and GPS in the receiver at first.",
+        above=0.0,
+        maximum=1.0e4,
+    )
+    inter_system_std_glonass: float = parameter(30.0, "m", "The same for GLONASS.", above=0.0, maximum=1.0e4)
+    inter_system_noise: float = parameter(
+        0.02, "m/rts", "How fast these offsets wander.", minimum=0.0, maximum=100.0, live=True
+    )
+    use_point_solution: bool = parameter(
+        False,
+        "",
+        "In mode loose: solve each epoch of topics.ranges for position and velocity, and fuse these instead of the "
+        "receiver's own fixes.",
+    )
+    rinex_nav_files: str = parameter(
+        "",
+        "",
+        "RINEX navigation files with the orbits and clocks of the satellites, separated by colons. Empty: they come "
+        "by topics.ephemerides, or topics.ranges brings the satellites itself.",
+        pattern=r"[^\0]*",
+        pattern_text="paths separated by colons, or nothing",
+    )
