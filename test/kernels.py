@@ -10,10 +10,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter import layout, predict
+from eskf_ros.filter import predict
+from eskf_ros.filter.history.records import IMU
 from eskf_ros.filter.inertial.navigation_frame import set_datum
+from eskf_ros.filter.layout import STATE, WORK, blank_state
 from eskf_ros.filter.loop import take_sample
 from eskf_ros.filter.settings import settings_from
+from eskf_ros.filter.state.memory import allocate
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.parameters.mapping import from_mapping
 
@@ -30,7 +33,7 @@ def make_settings(**parameters: Any) -> Any:
 
 
 def make_work() -> Any:
-    return layout.allocate(layout.WORK)[0]
+    return allocate(WORK)[0]
 
 
 def to_rotation(quaternion: Any) -> Rotation:
@@ -51,7 +54,7 @@ def make_state(
     datum: tuple[float, float, float] | None = (48.137, 11.575, 565.0),
 ) -> Any:
     """Return the record of a running filter: everything known, biases zero, covariance zero."""
-    state = layout.blank_state()[0]
+    state = blank_state()[0]
     if datum is not None:
         set_datum(state, math.radians(datum[0]), math.radians(datum[1]), datum[2])
     state["position_map"] = position
@@ -88,7 +91,7 @@ def core(state: Any) -> Array:
 
 def copy_of(state: Any) -> Any:
     """Return a record of its own with the same contents."""
-    copy = layout.allocate(layout.STATE)
+    copy = allocate(STATE)
     copy[0] = state
     return copy[0]
 
@@ -151,7 +154,7 @@ def run_samples(
     state: Any, stamps: Any, force: Any, rate: Any, settings: Any, work: Any, cuts: NDArray[np.int64] | None = None
 ) -> None:
     """Propagate ``state``, which stands at the first sample, through all the others, cut at the stamps ``cuts``."""
-    samples = layout.allocate(layout.IMU, len(stamps))
+    samples = allocate(IMU, len(stamps))
     samples["stamp"], samples["specific_force"], samples["angular_rate"] = stamps, force, rate
     _run_samples(state, samples, np.zeros(0, np.int64) if cuts is None else cuts, settings, work)
 

@@ -228,9 +228,9 @@ def driving(speed: float, lateral_acceleration: float) -> Any:
 
 def test_the_constraint_is_looser_in_turns_and_while_wheels_slip() -> None:
     straight, turning, slipping = driving(10.0, 0.0), driving(10.0, 2.0), driving(10.0, 0.0)
-    slipping["slip_stamp"] = slipping["stamp"] - 10**9
+    slipping["rest"]["slip_stamp"] = slipping["stamp"] - 10**9
     over = driving(10.0, 0.0)
-    over["slip_stamp"] = over["stamp"] - 2 * 10**9
+    over["rest"]["slip_stamp"] = over["stamp"] - 2 * 10**9
     assert deviation(turning) > 1.5 * deviation(straight)
     assert deviation(slipping) > 3.0 * deviation(straight)
     assert deviation(over) == deviation(straight)

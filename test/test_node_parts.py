@@ -870,7 +870,7 @@ def test_compiling_is_told_and_loading_from_the_cache_is_not(tmp_path: Path) -> 
     ("file", "is_compiled_anew"),
     [
         ("filter/measurements/kalman_update.py", True),  # has kernels
-        ("filter/state/layout.py", True),  # has none, but kernels take its constants
+        ("filter/state/error_state.py", True),  # has none, but kernels take its constants
         ("ros_node/two_d.py", True),
         ("replay/main.py", False),
         ("api.py", False),

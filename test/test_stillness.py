@@ -89,7 +89,7 @@ def offered(stream: Stream, stamp: int, values: Any, stds: Any) -> Any:
 )
 def test_what_one_message_says(stream: Stream, values: Any, stds: Any, says: str) -> None:
     state = make_state()
-    update_rest_evidence(state, offered(stream, 7 * SECOND, values, stds), SETTINGS)
+    update_rest_evidence(state, offered(stream, 7 * SECOND, values, stds))
     assert state["rest"]["resting_stamp"] == (7 * SECOND if says == "rest" else NEVER)
     assert state["rest"]["moving_stamp"] == (7 * SECOND if says == "motion" else NEVER)
 
@@ -117,9 +117,7 @@ def test_fixes_tell_rest_from_motion_as_soon_as_they_can(std: float, speed: floa
     start = SECOND
     for elapsed in (0.0, seconds):
         stamp = start + round(elapsed * SECOND)
-        update_rest_evidence(
-            state, offered(Stream.GNSS_POSITION, stamp, place(speed * elapsed), (std, std, std)), SETTINGS
-        )
+        update_rest_evidence(state, offered(Stream.GNSS_POSITION, stamp, place(speed * elapsed), (std, std, std)))
     assert (state["rest"]["resting_stamp"] > NEVER) == (says == "rest")
     assert (state["rest"]["moving_stamp"] > NEVER) == (says == "motion")
 
@@ -130,9 +128,7 @@ def test_pressure_that_changes_is_motion(climb: float, moves: bool) -> None:
     state["rest"]["quiet"] = 1
     for second, height in ((1, 0.0), (9, climb)):
         pressure = 95_000.0 - 11.8 * height
-        update_rest_evidence(
-            state, offered(Stream.BARO, second * SECOND, (pressure, 0.0, 0.0), (5.0, -1.0, -1.0)), SETTINGS
-        )
+        update_rest_evidence(state, offered(Stream.BARO, second * SECOND, (pressure, 0.0, 0.0), (5.0, -1.0, -1.0)))
     assert (state["rest"]["moving_stamp"] > NEVER) == moves
 
 
