@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from ros_process import Process, Ros
 
-from eskf_ros.filter.navigator import compile_kernels
+from eskf_ros.filter.warm_up import compile_kernels
 from eskf_ros.parameters.mapping import leaves
 from eskf_ros.replay.main import main as replay
 

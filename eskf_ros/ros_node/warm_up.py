@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from eskf_ros.filter.navigator import compile_kernels
 from eskf_ros.filter.output.global_odometry import ODOMETRY
 from eskf_ros.filter.state.memory import allocate
+from eskf_ros.filter.warm_up import compile_kernels
 from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.inputs.epochs import compile_ranges
 from eskf_ros.parameters.tree import Parameters

@@ -1,0 +1,73 @@
+"""The buffers of the history: they grow with the window and the rates of the messages, not with time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from eskf_ros.filter.history.records import AID, IMU, TIMELINE
+from eskf_ros.filter.history.timeline import CHECKPOINT_SPACING, doubled, forget
+from eskf_ros.filter.state.memory import allocate
+from eskf_ros.filter.state.time import NEVER
+
+IMU_BATCH = 1024
+"""IMU samples that are taken at a time."""
+
+FIRST_SIZE = 256
+"""Measurements, and checkpoints, for which there is room at first."""
+
+
+class Buffers:
+    """IMU samples, offered measurements, checkpoints of the state and published rows, each in one growing array."""
+
+    def __init__(self, state: np.dtype, row: np.dtype) -> None:
+        """``state`` and ``row``: the records of checkpoints and of what is published for an IMU sample."""
+        self.imu = allocate(IMU, 4 * IMU_BATCH)
+        self.aids = allocate(AID, FIRST_SIZE)
+        self.checkpoints = allocate(state, FIRST_SIZE)
+        self.rows = allocate(row, len(self.imu))
+        self.timeline = allocate(TIMELINE)
+
+    def restart(self, window: int) -> None:
+        """Forget everything; ``window`` (ns) is how far back late messages are taken in."""
+        self.timeline = allocate(TIMELINE)
+        for field in ("frontier", "published", "barrier"):
+            self.timeline[field] = NEVER
+        self.timeline["rewind_to"] = -NEVER
+        self.timeline["window"] = window
+
+    @property
+    def held_bytes(self) -> int:
+        """Memory of the buffers."""
+        return sum(buffer.nbytes for buffer in (self.imu, self.aids, self.checkpoints, self.rows))
+
+    def _wanted(self, aids: int, constraints: int) -> tuple[int, int, int]:
+        """IMU samples, measurements and checkpoints after one batch and ``aids`` measurements.
+
+        An interval between two samples has room for one grid point of the constraints.
+        """
+        timeline = self.timeline[0]
+        return (
+            int(timeline["imu_count"]) + IMU_BATCH,
+            int(timeline["aid_count"]) + 1 + aids + IMU_BATCH * constraints,
+            int(timeline["checkpoint_count"]) + IMU_BATCH // CHECKPOINT_SPACING + 2,
+        )
+
+    def have_room(self, aids: int, constraints: int) -> bool:
+        """Whether a batch of IMU samples and ``aids`` measurements fit in, with ``constraints`` at each grid point."""
+        wanted = self._wanted(aids, constraints)
+        return all(len(held) >= size for held, size in zip((self.imu, self.aids, self.checkpoints), wanted))
+
+    def forget(self, states: np.ndarray) -> None:
+        """Drop what no message in time can reach any more."""
+        forget(states, self.imu, self.aids, self.checkpoints, self.timeline)
+
+    def grow(self, aids: int, constraints: int) -> None:
+        """Make the buffers twice as large as what has to fit in (see `have_room`)."""
+        imu, offered, checkpoints = self._wanted(aids, constraints)
+        while len(self.imu) < 2 * imu:
+            self.imu = doubled(self.imu)
+            self.rows = doubled(self.rows)
+        while len(self.aids) < 2 * offered:
+            self.aids = doubled(self.aids)
+        while len(self.checkpoints) < 2 * checkpoints:
+            self.checkpoints = doubled(self.checkpoints)

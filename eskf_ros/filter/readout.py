@@ -1,0 +1,174 @@
+"""What can be read of a filter: the estimate, its status, counts, and what is wrong. Nothing here changes it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from eskf_ros.filter.alignment.warm_start import Memory
+from eskf_ros.filter.history.arguments import copied
+from eskf_ros.filter.history.buffers import Buffers
+from eskf_ros.filter.history.records import RECORD
+from eskf_ros.filter.integrity.heading_monitor import complaints, is_heading_contradicted
+from eskf_ros.filter.integrity.receiver_monitor import aid_complaints
+from eskf_ros.filter.integrity.recovery import phase_of
+from eskf_ros.filter.integrity.traffic import Traffic
+from eskf_ros.filter.layout import STATE
+from eskf_ros.filter.output.global_odometry import ODOMETRY, status_of, write_odometry
+from eskf_ros.filter.state.enums import Phase, Status, Stream
+from eskf_ros.filter.state.error_state import ERROR_SIZE, INTER_SYSTEM
+from eskf_ros.filter.state.memory import allocate
+from eskf_ros.filter.state.time import NEVER, SECOND
+from eskf_ros.geodesy.earth import east_north_up_to_ecef, ecef_to_geodetic
+from eskf_ros.geodesy.rotation import to_matrix
+
+
+class Readout:
+    """The readable side of a `Navigator`, which owns what is read here."""
+
+    _states: np.ndarray
+    _settings: np.ndarray
+    _local: np.ndarray
+    _buffers: Buffers
+    _traffic: Traffic
+
+    @property
+    def odometry(self) -> np.ndarray:
+        """One ODOMETRY row of the state at the newest IMU sample (array of length one)."""
+        row = allocate(ODOMETRY)
+        write_odometry(self._states[0], self._local[0], self._settings[0], row[0])
+        return copied(row, 1)
+
+    @property
+    def state(self) -> np.ndarray:
+        """A copy of the whole state (STATE, array of length one)."""
+        return np.array(self._states, STATE)
+
+    @property
+    def status(self) -> Status:
+        """The rung of the start-up ladder at the newest IMU sample."""
+        return Status(status_of(self._states[0], self._settings[0]))
+
+    @property
+    def memory(self) -> Memory | None:
+        """What the next start wants to know (see `warm_start`); None while position or heading are unknown."""
+        state, row = self._states[0], self.odometry[0]
+        if row["status"] not in (Status.ALIGNING, Status.GOOD, Status.COASTING, Status.DEGRADED):
+            return None
+        ecef = state["frame"]["origin_ecef"] + state["frame"]["map_to_ecef"] @ row["position_map"]
+        latitude, longitude, altitude = ecef_to_geodetic(*ecef)
+        forward_map = np.array(to_matrix(tuple(row["attitude_body_to_map"])))[:, 0]
+        east, north, _ = (
+            np.array(east_north_up_to_ecef(latitude, longitude)).T @ state["frame"]["map_to_ecef"] @ forward_map
+        )
+        variances = np.diagonal(row["pose_covariance"])
+        biases = {
+            name: tuple(row[name].tolist()) for name in ("accel_bias", "accel_bias_std", "gyro_bias", "gyro_bias_std")
+        }
+        return Memory(
+            stamp=int(row["stamp"]),
+            latitude_deg=math.degrees(latitude),
+            longitude_deg=math.degrees(longitude),
+            altitude=float(altitude),
+            position_std=math.sqrt(max(variances[:3])),
+            heading_deg=math.degrees(math.atan2(north, east)),
+            heading_std_deg=math.degrees(math.sqrt(variances[5])),
+            **biases,
+        )
+
+    @property
+    def datum(self) -> tuple[float, float, float] | None:
+        """Origin of the map frame: latitude and longitude (deg) and altitude (m), None before the first fix."""
+        state = self._states[0]
+        if not state["frame"]["datum_known"]:
+            return None
+        latitude, longitude, altitude = (float(value) for value in state["frame"]["datum"])
+        return math.degrees(latitude), math.degrees(longitude), altitude
+
+    @property
+    def clock(self) -> tuple[float, float] | None:
+        """Bias (m) and drift (m/s) of the receiver's clock; None while ranges have not told both."""
+        state, place = self._states[0], int(self._settings["clock_at"][0])
+        if place >= state["error_size"] or not state["tight"]["clock_known"].all():
+            return None
+        bias, drift = state["optional"][place - ERROR_SIZE : place - ERROR_SIZE + 2].tolist()
+        return bias, drift
+
+    @property
+    def inter_system_offsets(self) -> dict[int, float]:
+        """By what the ranges of a constellation (`gnss.signals.time_group`) are longer than those of GPS (m).
+
+        Those of which no signal came are not there.
+        """
+        state, first = self._states[0], int(self._settings["inter_system_at"][0])
+        offsets = state["optional"][first - ERROR_SIZE : max(first, int(state["error_size"])) - ERROR_SIZE].tolist()
+        return {group: offset for group, offset in zip(INTER_SYSTEM, offsets) if offset}
+
+    @property
+    def latest_epoch(self) -> np.ndarray:
+        """Records of the pseudoranges of the newest epoch that was judged, as they stand; none after a long silence."""
+        judged = self._buffers.aids[: int(self._states["aid_next"][0])]
+        codes = judged[judged["stream"] == Stream.PSEUDORANGE]
+        newest = codes[codes["stamp"] == codes["stamp"].max(initial=NEVER)]
+        return np.array([tuple(row[name] for name in RECORD.names or ()) for row in newest], RECORD)
+
+    @property
+    def clock_jumps(self) -> int:
+        """Milliseconds by which the receiver's clock has jumped, to either side."""
+        return int(self._states["tight"]["clock_jumps"][0])
+
+    @property
+    def range_faults(self) -> int:
+        """How often most satellites contradicted the estimate, which was then given the uncertainty they show."""
+        return int(self._states["tight"]["range_faults"][0])
+
+    @property
+    def imu_counts(self) -> dict[str, int]:
+        """IMU samples offered, and refused or replaced by reason."""
+        names = ("offered", "duplicate", "late", "bad_value", "bad_stamp")
+        return {name: int(self._buffers.timeline[f"imu_{name}"][0]) for name in names}
+
+    @property
+    def waiting(self) -> int:
+        """How many measurements wait for the IMU samples of their time."""
+        return int(self._buffers.timeline["aid_count"][0] - self._states["aid_next"][0])
+
+    @property
+    def window_needed(self) -> float:
+        """The window (s) that would have kept every message so far; 0 when none was too late."""
+        return float(self._buffers.timeline["furthest_late"][0]) / SECOND
+
+    @property
+    def restarts(self) -> int:
+        """How often the alignment started again: after a long silence of the IMU, or many rejected fixes in a row."""
+        return int(self._states["restarts"][0])
+
+    @property
+    def position_resets(self) -> int:
+        """How often fixes that agree with each other won over the filter: position and velocity were reset to them."""
+        return int(self._states["recovery"]["resets"][0])
+
+    def phase(self, stream: Stream, source: int = 0) -> Phase:
+        """Return what an aid is to the filter at the moment; ``source``: which receiver."""
+        return Phase(phase_of(self._states[0], int(stream), source))
+
+    @property
+    def complaints(self) -> list[str]:
+        """What is wrong with whole streams, one sentence each with what to do; empty when nothing is."""
+        state = self._states[0]
+        found = complaints(state)
+        # With a wrong heading the fixes seem to be wrong in many ways, which then mean nothing.
+        if not is_heading_contradicted(state):
+            found += aid_complaints(state, self._settings[0])
+        return found + self._traffic.complaints()
+
+    @property
+    def notes(self) -> list[str]:
+        """What is worth knowing of the streams though nothing is wrong: one sentence each."""
+        return self._traffic.notes()
+
+    @property
+    def held_bytes(self) -> int:
+        """Memory of the history buffers: grows with window and rates, not with time."""
+        return self._buffers.held_bytes
