@@ -20,7 +20,7 @@ from simulated_ranges import Ranges, run_tight, simulate_ranges, tight_navigator
 from eskf_ros.compiled import COMPILED
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import Status, Stream, Verdict
-from eskf_ros.filter.tight.epoch import MILLISECOND, TIGHT
+from eskf_ros.filter.tight.receiver_clock import MILLISECOND, TIGHT
 from eskf_ros.gnss.ranges import DOPPLER_VALID
 from eskf_ros.gnss.ranges import Status as RangeStatus
 from eskf_ros.gnss.signals import Gnss

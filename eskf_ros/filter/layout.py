@@ -40,7 +40,8 @@ from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity.detector import REST
 from eskf_ros.filter.stationarity.residual_motion import RESIDUAL_MOTION
 from eskf_ros.filter.stationarity.static_window import STATIC_WINDOW
-from eskf_ros.filter.tight.epoch import LARGEST_EPOCH, TIGHT
+from eskf_ros.filter.tight.epoch_least_squares import LARGEST_EPOCH
+from eskf_ros.filter.tight.receiver_clock import TIGHT
 
 STATE = np.dtype(
     [

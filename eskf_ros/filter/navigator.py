@@ -35,7 +35,7 @@ from eskf_ros.filter.settings import intakes_from, recall, settings_from
 from eskf_ros.filter.state.enums import Stream, Verdict
 from eskf_ros.filter.state.memory import allocate
 from eskf_ros.filter.state.time import NEVER, SECOND
-from eskf_ros.filter.tight.epoch import offer_signals
+from eskf_ros.filter.tight.intake import offer_signals
 from eskf_ros.geodesy.earth import ecef_to_geodetic
 from eskf_ros.geodesy.magnetic_model import FieldUnknown, field_at
 from eskf_ros.geodesy.rotation import to_matrix
