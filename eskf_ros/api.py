@@ -27,11 +27,11 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,29 +40,23 @@ from eskf_ros.filter.history.records import RECORD
 from eskf_ros.filter.history.timeline import EARLY_AIDS, JUMP_CONFIRMATIONS, LARGEST_JUMP
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.output.global_odometry import ODOMETRY
-from eskf_ros.filter.state.enums import CONSTRAINTS, STREAM_NAMES, Status, Stream, Verdict
-from eskf_ros.geodesy.map_frame import MapFrame, to_geodetic
+from eskf_ros.filter.rows import ROWS
+from eskf_ros.filter.state.enums import CONSTRAINTS, STREAM_NAMES, Stream, Verdict
 from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.parameters.ros_yaml import load
 from eskf_ros.parameters.tree import Parameters
-from eskf_ros.replay.summary import CHI_SQUARE_95, counted, final_result, named
+from eskf_ros.replay.summary import final_result
+from eskf_ros.tables.columns import Array, Stamps, Table, in_order
+from eskf_ros.tables.results import aid_summary, as_table, innovation_table, trajectory_table
 
 __all__ = ["Filter", "Result", "run"]
 
-Array = NDArray[np.float64]
-Stamps = NDArray[np.int64]
 ParametersLike = str | PathLike[str] | Parameters | Mapping[str, object] | None
 
 SECOND = 1_000_000_000
 LARGEST_CHUNK = 1024
 UNMEASURED = -1.0
 
-SMALLEST_NANOSECONDS = 10**12
-"""Integers below are taken for seconds or milliseconds."""
-LARGEST_SECONDS = 1e11
-"""Floating point numbers above are taken for nanoseconds."""
-SHORTEST_STEP = 100_000
-"""Integers that usually follow each other more closely (ns) are milliseconds or microseconds."""
 
 DROPS = {
     Verdict.OUTSIDE_HISTORY: "older than the window history.window behind the IMU, or in a gap of the IMU",
@@ -84,28 +78,8 @@ IMU_DROPS = {
 }
 
 
-class _Kind(NamedTuple):
-    """An input: its stream; the columns of its values; what of them may be left out; whether they share a unit."""
-
-    stream: Stream
-    columns: tuple[str, ...]
-    optional: str = ""
-    one_unit: bool = True
-
-    @property
-    def is_vector(self) -> bool:
-        return len(self.columns) == 1 and self.stream != Stream.BARO
-
-
-_KINDS = {
-    "gnss_position": _Kind(Stream.GNSS_POSITION, ("latitude_deg", "longitude_deg", "altitude")),
-    "gnss_velocity": _Kind(Stream.GNSS_VELOCITY, ("velocity",)),
-    "wheel": _Kind(Stream.WHEEL, ("speed", "yaw_rate"), "yaw_rate", one_unit=False),
-    "body_velocity": _Kind(Stream.BODY_VELOCITY, ("velocity",)),
-    "heading": _Kind(Stream.HEADING, ("yaw", "pitch"), "pitch"),
-    "mag": _Kind(Stream.MAG, ("field",)),
-    "baro": _Kind(Stream.BARO, ("pressure",)),
-}
+_KINDS = {row.name: row for row in ROWS if row.columns}
+"""What can be pushed, by name: the rows of the measurements."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +141,7 @@ class Filter:
 
     def push_imu(self, imu: Any) -> None:
         """Take IMU samples; columns as in the head of this module. Raises ValueError for a table of another form."""
-        table = _Table("imu", imu)
+        table = Table("imu", imu)
         stamps = table.stamps()
         values = np.column_stack(
             [table.vector("specific_force", len(stamps)), table.vector("angular_rate", len(stamps))]
@@ -175,40 +149,46 @@ class Filter:
         self._note("imu", table, stamps)
         self._imu_parts.append((stamps, values))
 
+    def push(self, name: str, table: Any) -> None:
+        """Take measurements; ``name`` and columns as in the head of this module, errors as in `push_imu`."""
+        if name not in _KINDS:
+            raise ValueError(f"{name}: no such measurement; there are {', '.join(_KINDS)}")
+        self._push(name, table)
+
     def push_gnss_position(self, gnss_position: Any) -> None:
-        """Take positions of the GNSS antenna; columns and errors as in `push_imu`."""
-        self._push("gnss_position", gnss_position)
+        """Take positions of the GNSS antenna."""
+        self.push("gnss_position", gnss_position)
 
     def push_gnss_velocity(self, gnss_velocity: Any) -> None:
-        """Take velocities of the GNSS antenna; columns and errors as in `push_imu`."""
-        self._push("gnss_velocity", gnss_velocity)
+        """Take velocities of the GNSS antenna."""
+        self.push("gnss_velocity", gnss_velocity)
 
     def push_wheel(self, wheel: Any) -> None:
-        """Take wheel odometry; columns and errors as in `push_imu`."""
-        self._push("wheel", wheel)
+        """Take wheel odometry."""
+        self.push("wheel", wheel)
 
     def push_body_velocity(self, body_velocity: Any) -> None:
-        """Take velocities in the axes of the vehicle; columns and errors as in `push_imu`."""
-        self._push("body_velocity", body_velocity)
+        """Take velocities in the axes of the vehicle."""
+        self.push("body_velocity", body_velocity)
 
     def push_heading(self, heading: Any) -> None:
-        """Take headings of a baseline; columns and errors as in `push_imu`."""
-        self._push("heading", heading)
+        """Take headings of a baseline."""
+        self.push("heading", heading)
 
     def push_mag(self, mag: Any) -> None:
-        """Take magnetic fields; columns and errors as in `push_imu`."""
-        self._push("mag", mag)
+        """Take magnetic fields."""
+        self.push("mag", mag)
 
     def push_baro(self, baro: Any) -> None:
-        """Take air pressures; columns and errors as in `push_imu`."""
-        self._push("baro", baro)
+        """Take air pressures."""
+        self.push("baro", baro)
 
     def update(self) -> NDArray[Any]:
         """Process what was pushed, in the order of stamps, up to the newest IMU sample; newer measurements wait.
 
         Returns the new ODOMETRY rows (`filter.layout`), one for each new IMU sample on the output grid.
         """
-        stamps, imu = _sorted(self._imu_parts, 6)
+        stamps, imu = in_order(self._imu_parts, 6)
         self._imu_parts = []
         aids = self._take_aids(int(stamps[-1]) if len(stamps) else None)
         rows: list[NDArray[Any]] = []
@@ -259,7 +239,7 @@ class Filter:
         summary = {
             "imu": navigator.imu_counts,
             "aids": {
-                STREAM_NAMES[stream]: _aid_summary(records[records["stream"] == stream])
+                STREAM_NAMES[stream]: aid_summary(records[records["stream"] == stream])
                 for stream in Stream
                 if (records["stream"] == stream).any()
             },
@@ -269,9 +249,9 @@ class Filter:
             "final": final_result(navigator.odometry[0], navigator.datum),
         }
         return Result(
-            _trajectory(rows, navigator.datum),
-            _innovations(records),
-            _table(
+            trajectory_table(rows, navigator.datum),
+            innovation_table(records),
+            as_table(
                 {name: rows[name] for name in ("stamp", "accel_bias", "gyro_bias", "accel_bias_std", "gyro_bias_std")}
             ),
             [*navigator.complaints, *navigator.notes, *self._drops(summary)],
@@ -299,7 +279,7 @@ class Filter:
         group = "gnss" if name in ("gnss_position", "gnss_velocity") else name
         return round(getattr(self._parameters, group).time_offset * SECOND)
 
-    def _note(self, name: str, table: _Table, stamps: Stamps) -> None:
+    def _note(self, name: str, table: Table, stamps: Stamps) -> None:
         """Keep what is said of a table later."""
         unused = self._unused.setdefault(name, [])
         unused += [column for column in table.unused() if column not in unused]
@@ -309,11 +289,11 @@ class Filter:
 
     def _push(self, name: str, source: Any) -> None:
         """Keep a table of measurements as stamps (n,) and rows (n, 14): values, covariance, its type, status."""
-        kind, table = _KINDS[name], _Table(name, source)
+        kind, table = _KINDS[name], Table(name, source)
         stamps = table.stamps()
         count = len(stamps)
         rows = np.zeros((count, 14))
-        missing = kind.optional if kind.optional and not table.has(kind.optional) else ""
+        missing = kind.optional_column if kind.optional_column and not table.has(kind.optional_column) else ""
         if kind.is_vector:
             rows[:, :3] = table.vector(kind.columns[0], count)
         else:
@@ -322,7 +302,7 @@ class Filter:
                     rows[:, place] = table.scalar(column, count)
         axes = ("x", "y", "z") if kind.is_vector or name == "gnss_position" else kind.columns
         axes = tuple(axis for axis in axes if axis != missing)
-        covariance = table.covariance(axes, count, kind.one_unit)
+        covariance = table.covariance(axes, count, kind.has_one_unit)
         if covariance is None and missing:
             raise ValueError(f"{name}: the column covariance is missing: without {missing} it has to be given")
         if covariance is not None:
@@ -346,7 +326,7 @@ class Filter:
         limit = max((stamp for stamp in (newest, self._newest) if stamp is not None), default=None)
         taken: list[tuple[int, str, int, Array]] = []
         for name, parts in self._aid_parts.items():
-            stamps, rows = _sorted(parts, 14)
+            stamps, rows = in_order(parts, 14)
             offset = self._offset(name)
             count = 0 if limit is None else int(np.searchsorted(stamps, limit - offset, "right"))
             taken += [(stamp + offset, name, stamp, row) for stamp, row in zip(stamps[:count].tolist(), rows[:count])]
@@ -398,10 +378,12 @@ def run(
     baro: Any = None,
     parameters: ParametersLike = None,
     output_rate: float = 0.0,
+    **others: Any,
 ) -> Result:
     """Run the filter over whole recordings: tables as in the head of this module, None for what there is not.
 
-    ``parameters`` and ``output_rate`` (Hz) as in `Filter`.
+    ``parameters`` and ``output_rate`` (Hz) as in `Filter`. ``others``: tables of measurements that you added, by name
+    (``docs/add_a_measurement.md``).
 
     Raises:
         ValueError: a table cannot be used, or has no time in common with the IMU; the message says what to do.
@@ -416,155 +398,15 @@ def run(
         "heading": heading,
         "mag": mag,
         "baro": baro,
+        **others,
     }
     runner = Filter(parameters, output_rate)
     runner.push_imu(imu)
     for name, table in tables.items():
         if table is not None:
-            getattr(runner, f"push_{name}")(table)
+            runner.push(name, table)
     runner._refuse_apart()
     return runner.result()
-
-
-class _Table:
-    """A table of one input, read column by column."""
-
-    def __init__(self, name: str, source: Any) -> None:
-        self._name = name
-        self._source = source
-        if isinstance(source, Mapping):
-            self._names = [str(column) for column in source]
-        elif isinstance(source, np.ndarray) and source.dtype.names:
-            self._names = list(source.dtype.names)
-        elif hasattr(source, "columns"):
-            self._names = [str(column) for column in source.columns]
-        else:
-            raise ValueError(
-                f"{name}: a {type(source).__name__} is no table: give a mapping of arrays, a structured array or a "
-                "DataFrame"
-            )
-        self._used: set[str] = set()
-
-    def has(self, column: str) -> bool:
-        return column in self._names
-
-    def unused(self) -> list[str]:
-        """The columns that nobody has asked for."""
-        return [column for column in self._names if column not in self._used]
-
-    def stamps(self) -> Stamps:
-        """The stamps as int64 ns (n,)."""
-        self._require("stamp")
-        self._used.add("stamp")
-        found = np.asarray(self._source["stamp"])
-        if found.ndim != 1:
-            raise ValueError(f"{self._name}: the column stamp has the shape {found.shape}: give one stamp a row, (n,)")
-        if not len(found):
-            if self._name == "imu":
-                raise ValueError("imu: the column stamp is empty: give at least one sample")
-            return np.zeros(0, np.int64)
-        return _nanoseconds(self._name, found)
-
-    def scalar(self, column: str, count: int) -> Array:
-        """A column (n,)."""
-        return self._numbers(column, count, ((),))
-
-    def vector(self, column: str, count: int) -> Array:
-        """A vector (n, 3), of one column or of three."""
-        parts = [f"{column}_{axis}" for axis in "xyz"]
-        if not self.has(column) and any(self.has(part) for part in parts):
-            return np.column_stack([self.scalar(part, count) for part in parts])
-        return self._numbers(column, count, ((3,),))
-
-    def covariance(self, axes: tuple[str, ...], count: int, one_unit: bool) -> Array | None:
-        """Covariances (n, k, k) of k axes; None when there is no such column."""
-        size = len(axes)
-        parts = [f"covariance_{axis}" for axis in axes]
-        if not self.has("covariance"):
-            if not any(self.has(part) for part in parts):
-                return None
-            found = np.column_stack([self.scalar(part, count) for part in parts])
-        else:
-            shapes: tuple[tuple[int, ...], ...] = ((size,), (size, size), (size * size,))
-            found = self._numbers("covariance", count, (((),) if one_unit or size == 1 else ()) + shapes)
-        if found.ndim == 3:
-            return found
-        if found.ndim == 2 and found.shape[1] == size * size and size > 1:
-            return found.reshape(count, size, size)
-        variances = np.repeat(found[:, None], size, axis=1) if found.ndim == 1 else found
-        return np.asarray(variances[:, :, None] * np.eye(size), np.float64)
-
-    def _require(self, column: str) -> None:
-        if not self.has(column):
-            raise ValueError(
-                f"{self._name}: the column {column} is missing; there are: {', '.join(self._names) or 'none'}"
-            )
-
-    def _numbers(self, column: str, count: int, shapes: tuple[tuple[int, ...], ...]) -> Array:
-        """A column as float64, its rows in one of the shapes."""
-        self._require(column)
-        self._used.add(column)
-        found = np.asarray(self._source[column])
-        if found.dtype.kind not in "iuf":
-            raise ValueError(f"{self._name}: the column {column} is of type {found.dtype}: give numbers (float64)")
-        if found.shape not in [(count, *shape) for shape in shapes]:
-            wanted = " or ".join(str((count, *shape)) for shape in shapes)
-            raise ValueError(
-                f"{self._name}: the column {column} has the shape {found.shape}: {count} stamps need {wanted}"
-            )
-        return np.ascontiguousarray(found, np.float64)
-
-
-def _nanoseconds(name: str, stamps: NDArray[Any]) -> Stamps:
-    """Stamps (n,) as int64 ns; raises ValueError where it is not certain what they are."""
-
-    def refuse(row: int, why: str) -> ValueError:
-        return ValueError(f"{name}: the column stamp holds {stamps[row]} in row {row}, {why}")
-
-    if stamps.dtype.kind == "M":
-        if np.isnat(stamps).any():
-            raise refuse(int(np.argmax(np.isnat(stamps))), "which is no time: take such rows out")
-        return np.ascontiguousarray(stamps.astype("datetime64[ns]").astype(np.int64))
-    if stamps.dtype.kind in "iu":
-        largest = int(np.argmax(stamps))
-        if int(stamps[largest]) < SMALLEST_NANOSECONDS:
-            raise refuse(
-                largest,
-                "an integer too small for nanoseconds: multiply seconds by 10**9 and milliseconds by 10**6, or give "
-                "seconds as float64",
-            )
-        if int(stamps[largest]) > np.iinfo(np.int64).max:
-            raise refuse(largest, "too large for int64 nanoseconds")
-        found = np.ascontiguousarray(stamps, np.int64)
-        steps = np.diff(np.unique(found))
-        if len(steps) and np.median(steps) < SHORTEST_STEP:
-            raise refuse(
-                largest,
-                f"and the stamps are {int(np.median(steps))} apart, too close for nanoseconds: multiply milliseconds "
-                "by 10**6 and microseconds by 10**3",
-            )
-        return found
-    if stamps.dtype == np.float64:
-        if not np.isfinite(stamps).all():
-            raise refuse(int(np.argmin(np.isfinite(stamps))), "which is no time: take such rows out")
-        largest = int(np.argmax(np.abs(stamps)))
-        if abs(stamps[largest]) > LARGEST_SECONDS:
-            raise refuse(largest, "a float too large for seconds: give nanoseconds as int64, or divide to get seconds")
-        whole = np.floor(stamps)
-        return np.asarray(whole.astype(np.int64) * SECOND + np.rint((stamps - whole) * 1e9).astype(np.int64), np.int64)
-    raise refuse(
-        0,
-        f"of type {stamps.dtype}: give int64 nanoseconds, float64 seconds or datetime64 (in UTC, without a time zone)",
-    )
-
-
-def _sorted(parts: Iterable[tuple[Stamps, Array]], width: int) -> tuple[Stamps, Array]:
-    """All parts as one, by stamp and then by content: in whatever order they came."""
-    parts = list(parts)
-    stamps = np.concatenate([np.zeros(0, np.int64), *(part for part, _ in parts)])
-    rows = np.concatenate([np.zeros((0, width)), *(part for _, part in parts)])
-    order = np.lexsort((*rows.T[::-1], stamps))
-    return stamps[order], rows[order]
 
 
 def _end_of_chunk(stamps: Stamps, first: int, is_jump: bool) -> int:
@@ -586,76 +428,3 @@ def _parameters(given: ParametersLike) -> Parameters:
     if isinstance(given, str | PathLike):
         return load(Path(given))
     raise TypeError(f"parameters are a {type(given).__name__}: give a path, Parameters, a mapping or None")
-
-
-def _aid_summary(records: NDArray[Any]) -> dict[str, Any]:
-    """Counts and consistency of the records (n,) of one stream."""
-    counts = np.bincount(records["verdict"], minlength=len(Verdict))
-    tested = records[np.isfinite(records["nis"])]
-    inside = tested["nis"] <= CHI_SQUARE_95[tested["dof"]]
-    return {
-        **counted(counts),
-        "waiting": int(counts[Verdict.WAITING]),
-        "nis_mean": float(tested["nis"].mean()) if len(tested) else None,
-        "nis_in_95": float(inside.mean()) if len(tested) else None,
-        "verdicts": named(counts),
-    }
-
-
-def _trajectory(rows: NDArray[Any], datum: tuple[float, float, float] | None) -> Any:
-    known = rows["position_known"]
-    geodetic = np.full((len(rows), 3), math.nan)
-    if datum is not None and known.any():
-        geodetic[known] = to_geodetic(MapFrame(datum).to_ecef(np.ascontiguousarray(rows["position_map"][known])))
-    stds = np.sqrt(np.diagonal(rows["pose_covariance"], axis1=1, axis2=2))
-    hidden = ~known[:, None]
-    names = np.array([Status(value).name for value in range(max(Status) + 1)])
-    return _table(
-        {
-            "stamp": rows["stamp"],
-            "status": names[rows["status"]],
-            "position_known": known,
-            "heading_known": rows["heading_known"],
-            "latitude_deg": np.degrees(geodetic[:, 0]),
-            "longitude_deg": np.degrees(geodetic[:, 1]),
-            "altitude": geodetic[:, 2],
-            "position": np.where(hidden, math.nan, rows["position_map"]),
-            "velocity": np.where(hidden, math.nan, rows["velocity_map"]),
-            "attitude": rows["attitude_body_to_map"],
-            "position_std": np.where(hidden, math.nan, stds[:, :3]),
-            "rotation_std": stds[:, 3:],
-        }
-    )
-
-
-def _innovations(records: NDArray[Any]) -> Any:
-    return _table(
-        {
-            "aid": np.array(STREAM_NAMES)[records["stream"]],
-            "stamp": records["stamp"],
-            "verdict": np.array([verdict.name.lower() for verdict in sorted(Verdict)])[records["verdict"]],
-            "dof": records["dof"],
-            "nis": records["nis"],
-            "innovation": records["innovation"],
-        }
-    )
-
-
-def _table(columns: dict[str, NDArray[Any]]) -> Any:
-    """A DataFrame with a column for each element of a vector; without pandas a structured array."""
-    try:
-        import pandas  # type: ignore[import-untyped,import-not-found,unused-ignore]
-    except ImportError:
-        kinds = [(name, values.dtype, values.shape[1:]) for name, values in columns.items()]
-        table = np.zeros(len(next(iter(columns.values()))), np.dtype(kinds))
-        for name, values in columns.items():
-            table[name] = values
-        return table
-    flat: dict[str, NDArray[Any]] = {}
-    for name, values in columns.items():
-        if values.ndim == 1:
-            flat[name] = values
-        else:
-            axes = "wxyz" if values.shape[1] == 4 else "xyz"
-            flat |= {f"{name}_{axis}": values[:, place] for place, axis in enumerate(axes)}
-    return pandas.DataFrame(flat)

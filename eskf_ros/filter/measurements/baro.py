@@ -200,5 +200,6 @@ ROW = Row(
     place=Place("baro.position", inputs=("baro",)),
     settings=SETTINGS,
     describe=describe,
+    columns=("pressure",),
 )
 """The facts of this measurement."""

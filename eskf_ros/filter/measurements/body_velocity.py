@@ -151,5 +151,7 @@ ROW = Row(
     place=Place("body_velocity.mount_position", "body_velocity.mount_rpy_deg", ("body_velocity",)),
     settings=SETTINGS,
     describe=describe,
+    columns=("velocity",),
+    is_vector=True,
 )
 """The facts of this measurement."""

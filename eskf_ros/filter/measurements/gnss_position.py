@@ -126,5 +126,6 @@ ROW = Row(
     is_gnss=True,
     needs=NEEDS_LEVEL,
     augmented=augmented,
+    columns=("latitude_deg", "longitude_deg", "altitude"),
 )
 """The facts of this measurement."""

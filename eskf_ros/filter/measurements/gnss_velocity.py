@@ -89,5 +89,7 @@ ROW = Row(
     depth=50,
     is_gnss=True,
     needs=NEEDS_POSITION,
+    columns=("velocity",),
+    is_vector=True,
 )
 """The facts of this measurement."""

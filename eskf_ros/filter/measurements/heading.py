@@ -204,5 +204,7 @@ ROW = Row(
     place=Place(rotation="heading.mount_rpy_deg", inputs=("heading",)),
     settings=SETTINGS,
     describe=describe,
+    columns=("yaw", "pitch"),
+    optional_column="pitch",
 )
 """The facts of this measurement."""

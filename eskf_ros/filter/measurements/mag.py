@@ -331,5 +331,7 @@ ROW = Row(
     place=Place(rotation="mag.mount_rpy_deg", inputs=("mag",)),
     settings=SETTINGS,
     describe=describe,
+    columns=("field",),
+    is_vector=True,
 )
 """The facts of this measurement."""

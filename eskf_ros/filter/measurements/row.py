@@ -101,6 +101,9 @@ class Row:
     ``augmented`` makes the augmented states of the parameters. ``place``: where the sensor sits, if that counts.
     ``settings``: record of what the kernels read as ``settings.NAME``; ``describe`` fills it from the parameters.
     ``is_enabled``: for a constraint, whether the parameters switch it on.
+
+    For tables in memory (`eskf_ros.run`): ``columns`` of the values, one of which may be left out
+    (``optional_column``); ``is_vector``: one column of three numbers; ``has_one_unit``: one variance may do for all.
     """
 
     stream: Stream
@@ -122,6 +125,10 @@ class Row:
     settings: np.dtype = NOTHING
     describe: Callable[[np.void, Any], Any] = nothing
     is_enabled: Callable[[Any], bool] | None = None
+    columns: tuple[str, ...] = ()
+    optional_column: str = ""
+    is_vector: bool = False
+    has_one_unit: bool = True
 
     @property
     def name(self) -> str:

@@ -257,5 +257,8 @@ ROW = Row(
     augmented=augmented,
     settings=SETTINGS,
     describe=describe,
+    columns=("speed", "yaw_rate"),
+    optional_column="yaw_rate",
+    has_one_unit=False,
 )
 """The facts of this measurement."""

@@ -1,0 +1,1 @@
+"""Tables in and out of the filter for arrays in memory (`eskf_ros.api`)."""
