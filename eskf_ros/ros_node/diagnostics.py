@@ -3,25 +3,32 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.rows import SENSORS as ROWS_OF_SENSORS
 from eskf_ros.filter.state.enums import STREAM_NAMES, Phase, Status, Stream, Verdict
 from eskf_ros.filter.state.error_state import SOURCES
 from eskf_ros.filter.tight.signal import name_of
 from eskf_ros.gnss.signals import BEIDOU_3, Gnss
+from eskf_ros.inputs.epochs import RangeIntake
+from eskf_ros.inputs.table import Input
+from eskf_ros.parameters.tree import Parameters
 from eskf_ros.ros_node.clocks import SECOND, StampMonitor, clock_complaints
+from eskf_ros.ros_node.error_counter import Trouble
+from eskf_ros.ros_node.extrinsics import Extrinsics
 from eskf_ros.ros_node.messages import key_values
-
-if TYPE_CHECKING:
-    from eskf_ros.ros_node.node import EskfNode
+from eskf_ros.ros_node.publishers import Outputs
+from eskf_ros.ros_node.subscriptions import AidInput
 
 RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
 TRANSIENT_LOCAL, VOLATILE = DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE
@@ -47,19 +54,56 @@ SENSORS = (
 """Streams, and for receivers which of them, whose phase is told once something came."""
 
 
-def status_report(node: EskfNode, stamp: Time) -> DiagnosticArray:
+@dataclass(frozen=True)
+class Snapshot:
+    """What the node shows of itself once a second."""
+
+    graph: Node
+    """Who publishes and listens to what."""
+    now: int
+    """Time of the node's clock (ns)."""
+    navigator: Navigator
+    parameters: Parameters
+    imu_monitor: StampMonitor
+    aid_inputs: Sequence[AidInput]
+    inputs: Sequence[tuple[Any, Input | None]]
+    """Subscriptions, and which inputs they are."""
+    output_publishers: Sequence[Any]
+    outputs: Outputs
+    range_intake: RangeIntake | None
+    position_stream: Stream
+    """What brings the position: fixes or pseudoranges."""
+    latest_positions: Mapping[Verdict, int]
+    """Verdicts of the last fixes or pseudoranges."""
+    verdicts: Mapping[tuple[int, Verdict], int]
+    """Final verdicts by stream since the start."""
+    trouble: Trouble
+    extrinsics: Extrinsics
+    resets: int
+    callbacks: int
+    callback_time: float
+    longest_callback: float
+    """Seconds in callbacks of the IMU since the last report, and in the longest of them."""
+
+    @property
+    def monitors(self) -> list[StampMonitor]:
+        """What watches the stamps of the inputs, that of the IMU first."""
+        return [self.imu_monitor, *(monitor for source in self.aid_inputs for monitor in source.monitors)]
+
+
+def status_report(seen: Snapshot, stamp: Time) -> DiagnosticArray:
     """One status: OK when the state is GOOD and nothing is wrong, ERROR when nothing is published any more."""
-    now = node.now()
-    row = node.navigator.odometry[0]
+    now = seen.now
+    row = seen.navigator.odometry[0]
     status = Status(int(row["status"]))
-    is_silent = status > Status.WAITING_IMU and bool(missing(node, [node.imu_monitor], now))
+    is_silent = status > Status.WAITING_IMU and bool(missing(seen, [seen.imu_monitor], now))
     if is_silent and status != Status.FAULT:
         # Whatever the estimate was worth: nothing is published without the IMU.
         status = Status.WAITING_IMU
-    of_ranges = [] if node.range_intake is None else node.range_intake.recent_complaints
-    problems = [*node.navigator.complaints, *of_ranges, *clock_complaints(node.monitors, now)]
-    problems += [*mismatches(node), *second_publishers(node), *node.trouble.problems()]
-    waiting = waiting_for(node, status, row, now)
+    of_ranges = [] if seen.range_intake is None else seen.range_intake.recent_complaints
+    problems = [*seen.navigator.complaints, *of_ranges, *clock_complaints(seen.monitors, now)]
+    problems += [*mismatches(seen), *second_publishers(seen), *seen.trouble.problems()]
+    waiting = waiting_for(seen, status, row, now)
     level = DiagnosticStatus.OK if status == Status.GOOD and not problems else DiagnosticStatus.WARN
     if status == Status.FAULT or is_silent:
         level = DiagnosticStatus.ERROR
@@ -68,22 +112,22 @@ def status_report(node: EskfNode, stamp: Time) -> DiagnosticArray:
     report.status.append(
         DiagnosticStatus(
             level=level,
-            name=f"{node.get_fully_qualified_name()}: navigation",
+            name=f"{seen.graph.get_fully_qualified_name()}: navigation",
             hardware_id="eskf_ros",
             message="; ".join([status.name, *waiting, *problems]),
-            values=key_values({**figures(node, row), **ranges(node), **counters(node), **topics(node, now)}),
+            values=key_values({**figures(seen, row), **ranges(seen), **counters(seen), **topics(seen, now)}),
         )
     )
     return report
 
 
-def waiting_for(node: EskfNode, status: Status, row: np.void, now: int) -> list[str]:
+def waiting_for(seen: Snapshot, status: Status, row: np.void, now: int) -> list[str]:
     """What keeps the state from the next rung."""
-    wanted_input = "gnss_fix" if node.range_intake is None else "ranges"
-    fixes = next(source for source in node.aid_inputs if source.kind.name == wanted_input).monitors
-    is_tight = node.position_stream == Stream.PSEUDORANGE
+    wanted_input = "gnss_fix" if seen.range_intake is None else "ranges"
+    fixes = next(source for source in seen.aid_inputs if source.kind.name == wanted_input).monitors
+    is_tight = seen.position_stream == Stream.PSEUDORANGE
     if status in (Status.WAITING_IMU, Status.LEVELLING):
-        return missing(node, [node.imu_monitor], now) or ["standing still or driving steadily for a moment"]
+        return missing(seen, [seen.imu_monitor], now) or ["standing still or driving steadily for a moment"]
     if status == Status.FAULT:
         return ["a reset: call the service ~/reset"]
     if status == Status.DEGRADED:
@@ -92,20 +136,20 @@ def waiting_for(node: EskfNode, status: Status, row: np.void, now: int) -> list[
         unaccepted = (
             "ranges come, but too few were accepted lately" if is_tight else "fixes come, but none was accepted lately"
         )
-        return missing(node, fixes, now) or held_by_few(node, row) or [f"{unaccepted}{latest_verdicts(node)}"]
+        return missing(seen, fixes, now) or held_by_few(seen, row) or [f"{unaccepted}{latest_verdicts(seen)}"]
     if status == Status.WAITING_HEADING:
         way = "speeding up, braking or turning tells the heading, a constant velocity does not"
-        return missing(node, fixes, now) or [way]
+        return missing(seen, fixes, now) or [way]
     if status == Status.ALIGNING:
-        std, wanted = math.degrees(math.sqrt(row["pose_covariance"][5, 5])), node.parameters.alignment
+        std, wanted = math.degrees(math.sqrt(row["pose_covariance"][5, 5])), seen.parameters.alignment
         wanted_std = wanted.good_heading_std_deg
         return [f"a heading to {wanted_std:g} deg, which is known to {std:.1f} deg: drive, speed up, brake, turn"]
     return []
 
 
-def held_by_few(node: EskfNode, row: np.void) -> list[str]:
+def held_by_few(seen: Snapshot, row: np.void) -> list[str]:
     """Say so when satellites that are too few for a position of their own are fused nevertheless."""
-    epoch = node.navigator.latest_epoch
+    epoch = seen.navigator.latest_epoch
     fused = epoch[np.isin(epoch["verdict"], (Verdict.FUSED, Verdict.WEIGHED_DOWN))]
     count = len({name_of(source).split()[0] for source in fused["source"].tolist()})
     if not 0 < count < FEWEST_TO_SOLVE or row["stamp"] - fused["stamp"][0] > SILENCE * SECOND:
@@ -117,44 +161,44 @@ def held_by_few(node: EskfNode, row: np.void) -> list[str]:
     ]
 
 
-def latest_verdicts(node: EskfNode) -> str:
+def latest_verdicts(seen: Snapshot) -> str:
     """What became of the fixes, or of the pseudoranges, of the last report that has some."""
-    counts = node.latest_positions
+    counts = seen.latest_positions
     told = ", ".join(f"{count} {verdict.name.lower()}" for verdict, count in sorted(counts.items()))
     return f" (the last: {told}): see eskf/aids" if told else ": see eskf/aids"
 
 
-def missing(node: EskfNode, monitors: Sequence[StampMonitor], now: int) -> list[str]:
+def missing(seen: Snapshot, monitors: Sequence[StampMonitor], now: int) -> list[str]:
     """Say so when nothing comes on a topic, from any of those watched on it, and who could send."""
     silences = [silence for monitor in monitors if not math.isnan(silence := monitor.timing(now).silence)]
     if silences and min(silences) <= SILENCE:
         return []
     topic = monitors[0].topic
-    publishers = node.count_publishers(topic)
+    publishers = seen.graph.count_publishers(topic)
     since = f"no message for {min(silences):.0f} s" if silences else "no message"
-    return [f"{since} on {topic}; {publishers} publisher{'' if publishers == 1 else 's'}{elsewhere(node, topic)}"]
+    return [f"{since} on {topic}; {publishers} publisher{'' if publishers == 1 else 's'}{elsewhere(seen, topic)}"]
 
 
-def elsewhere(node: EskfNode, topic: str) -> str:
+def elsewhere(seen: Snapshot, topic: str) -> str:
     """Where else messages of the type of an input are published, if nobody publishes them on its topic."""
-    if node.count_publishers(topic):
+    if seen.graph.count_publishers(topic):
         return ""
-    kind = next(type_name(subscription.msg_type) for subscription, _ in node.inputs if subscription.topic_name == topic)
-    own = {subscription.topic_name for subscription, _ in node.inputs}
+    kind = next(type_name(subscription.msg_type) for subscription, _ in seen.inputs if subscription.topic_name == topic)
+    own = {subscription.topic_name for subscription, _ in seen.inputs}
     others = [
         name
-        for name, types in node.get_topic_names_and_types()
-        if kind in types and name not in own and node.count_publishers(name)
+        for name, types in seen.graph.get_topic_names_and_types()
+        if kind in types and name not in own and seen.graph.count_publishers(name)
     ]
     return f" ({kind} is published on {', '.join(others[:3])})" if others else ""
 
 
-def mismatches(node: EskfNode) -> list[str]:
+def mismatches(seen: Snapshot) -> list[str]:
     """Publishers whose messages cannot reach us, and subscribers that ours cannot reach: type or quality of service."""
     found = []
-    for subscription, kind in node.inputs:
+    for subscription, kind in seen.inputs:
         wanted, expected = subscription.qos_profile, type_name(subscription.msg_type)
-        for other in node.get_publishers_info_by_topic(subscription.topic_name):
+        for other in seen.graph.get_publishers_info_by_topic(subscription.topic_name):
             reason = ""
             if other.topic_type != expected:
                 reason = f"sends {other.topic_type}, {expected} is expected"
@@ -166,9 +210,9 @@ def mismatches(node: EskfNode) -> list[str]:
                 reason = "is volatile, this node was told to ask for transient local (qos_overrides)"
             if reason:
                 found.append(f"the publisher {node_name(other)} of {subscription.topic_name} {reason}")
-    for publisher in node.output_publishers:
+    for publisher in seen.output_publishers:
         offered = publisher.qos_profile
-        for other in node.get_subscriptions_info_by_topic(publisher.topic_name):
+        for other in seen.graph.get_subscriptions_info_by_topic(publisher.topic_name):
             reason = ""
             if other.qos_profile.reliability == RELIABLE and offered.reliability == BEST_EFFORT:
                 reason = "asks for reliable, but is offered best effort (qos_overrides)"
@@ -190,20 +234,20 @@ def node_name(endpoint: TopicEndpointInfo) -> str:
     return f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
 
 
-def second_publishers(node: EskfNode) -> list[str]:
+def second_publishers(seen: Snapshot) -> list[str]:
     """Transforms that are ours and that somebody else publishes too."""
-    output = node.outputs.transforms
+    output = seen.outputs.transforms
     if output is None or not output.watch.strangers:
         return []
-    own = node.get_fully_qualified_name()
-    names = sorted({node_name(end) for end in node.get_publishers_info_by_topic("/tf")} - {own})
+    own = seen.graph.get_fully_qualified_name()
+    names = sorted({node_name(end) for end in seen.graph.get_publishers_info_by_topic("/tf")} - {own})
     return [
         f"the transform {', '.join(output.watch.strangers)} is published by another node too (publishers of /tf: "
         f"{', '.join(names) or own}): stop one of them, or set output.tf to map_to_odom or none"
     ]
 
 
-def figures(node: EskfNode, row: np.void) -> dict[str, object]:
+def figures(seen: Snapshot, row: np.void) -> dict[str, object]:
     """Uncertainty, biases, and how much was published."""
     sigma = [math.sqrt(max(0.0, row["pose_covariance"][i, i])) for i in range(6)]
     return {
@@ -212,28 +256,28 @@ def figures(node: EskfNode, row: np.void) -> dict[str, object]:
         "heading std (deg)": f"{math.degrees(sigma[5]):.2f}",
         "accelerometer bias (m/s2)": " ".join(f"{value:.4f}" for value in row["accel_bias"]),
         "gyro bias (rad/s)": " ".join(f"{value:.6f}" for value in row["gyro_bias"]),
-        "odometries published": node.outputs.published,
-        "restarts": node.navigator.restarts,
-        "position resets": node.navigator.position_resets,
-        **phases(node),
-        "resets": node.resets,
-        "datum": node.navigator.datum,
-        "window needed (s)": node.navigator.window_needed,
-        "history (kB)": node.navigator.held_bytes // 1024,
-        "callback (ms)": f"{1e3 * node.callback_time / max(1, node.callbacks):.3f}",
-        "longest callback (ms)": f"{1e3 * node.longest_callback:.2f}",
-        **{f"place of the {sensor}": node.extrinsics.source_of(sensor) for sensor in node.extrinsics.sensors},
+        "odometries published": seen.outputs.published,
+        "restarts": seen.navigator.restarts,
+        "position resets": seen.navigator.position_resets,
+        **phases(seen),
+        "resets": seen.resets,
+        "datum": seen.navigator.datum,
+        "window needed (s)": seen.navigator.window_needed,
+        "history (kB)": seen.navigator.held_bytes // 1024,
+        "callback (ms)": f"{1e3 * seen.callback_time / max(1, seen.callbacks):.3f}",
+        "longest callback (ms)": f"{1e3 * seen.longest_callback:.2f}",
+        **{f"place of the {sensor}": seen.extrinsics.source_of(sensor) for sensor in seen.extrinsics.sensors},
     }
 
 
-def phases(node: EskfNode) -> dict[str, object]:
+def phases(seen: Snapshot) -> dict[str, object]:
     """What the measurements of the first receiver are to the filter, and of the other sensors those that came."""
     usual: tuple[Stream, ...] = (Stream.PSEUDORANGE,)
-    if node.position_stream != Stream.PSEUDORANGE:
+    if seen.position_stream != Stream.PSEUDORANGE:
         usual = (Stream.GNSS_POSITION, Stream.GNSS_VELOCITY)
-    found = {(stream, 0): node.navigator.phase(stream) for stream in usual}
+    found = {(stream, 0): seen.navigator.phase(stream) for stream in usual}
     for stream, source in SENSORS:
-        phase = node.navigator.phase(stream, source)
+        phase = seen.navigator.phase(stream, source)
         if phase != Phase.WAITING:
             found[stream, source] = phase
     return {
@@ -242,14 +286,14 @@ def phases(node: EskfNode) -> dict[str, object]:
     }
 
 
-def ranges(node: EskfNode) -> dict[str, object]:
+def ranges(seen: Snapshot) -> dict[str, object]:
     """What is known of the receiver's clock, and what became of the signals before the filter."""
-    navigator, intake = node.navigator, node.range_intake
+    navigator, intake = seen.navigator, seen.range_intake
     if intake is None:
         return {}
     found: dict[str, object] = {"epochs of ranges": intake.epochs, "point solutions": intake.solved}
     found.update({f"signals {status.name.lower()}": n for status, n in sorted(navigator.range_statuses.items())})
-    if node.position_stream != Stream.PSEUDORANGE:
+    if seen.position_stream != Stream.PSEUDORANGE:
         return found
     if navigator.clock is not None:
         bias, drift = navigator.clock
@@ -259,20 +303,20 @@ def ranges(node: EskfNode) -> dict[str, object]:
     return {**found, "clock jumps (ms)": navigator.clock_jumps, "range faults": navigator.range_faults}
 
 
-def counters(node: EskfNode) -> dict[str, object]:
+def counters(seen: Snapshot) -> dict[str, object]:
     """Measurements by stream and final verdict, IMU samples by what became of them, trouble by kind."""
     found: dict[str, object] = {
-        f"{STREAM_NAMES[stream]} {verdict.name.lower()}": count for (stream, verdict), count in node.verdicts.items()
+        f"{STREAM_NAMES[stream]} {verdict.name.lower()}": count for (stream, verdict), count in seen.verdicts.items()
     }
-    found.update({f"trouble: {kind}": count for kind, count in node.trouble.counts.items()})
-    found.update({f"imu {name}": count for name, count in node.navigator.imu_counts.items()})
+    found.update({f"trouble: {kind}": count for kind, count in seen.trouble.counts.items()})
+    found.update({f"imu {name}": count for name, count in seen.navigator.imu_counts.items()})
     return found
 
 
-def topics(node: EskfNode, now: int) -> dict[str, object]:
+def topics(seen: Snapshot, now: int) -> dict[str, object]:
     """Rate and delay of each input that was heard of."""
     found: dict[str, object] = {}
-    for monitor in node.monitors:
+    for monitor in seen.monitors:
         timing = monitor.timing(now)
         if not math.isnan(timing.silence):
             found[f"{monitor.label} rate (Hz)"] = f"{timing.rate:.1f}"

@@ -11,6 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from eskf_ros.filter.alignment.warm_start import Memory
+from eskf_ros.filter.navigator import Navigator
+from eskf_ros.filter.state.time import SECOND
+from eskf_ros.parameters.tree import WarmStart as WarmStartParameters
 
 VERSION = 1
 VECTORS = ("accel_bias", "accel_bias_std", "gyro_bias", "gyro_bias_std")
@@ -75,3 +78,37 @@ def _value(name: str, given: object) -> Any:
 def _is_finite(value: object) -> bool:
     """Whether it is a number that a float can hold; an integer of JSON may be larger, and True is an int too."""
     return isinstance(value, int | float) and not isinstance(value, bool) and -LARGEST_FLOAT <= value <= LARGEST_FLOAT
+
+
+class WarmStart:
+    """The memory of the last run: read at the start, offered at the first IMU sample, written at the end."""
+
+    def __init__(self, parameters: WarmStartParameters, logger: Any) -> None:
+        self._parameters, self._logger = parameters, logger
+        self._memory: Memory | None = None
+        if parameters.file:
+            try:
+                self._memory = read_memory(Path(parameters.file).expanduser())
+            except ValueError as error:
+                logger.warn(f"warm_start.file: {error}; starting without it")
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether there is a memory that was not offered yet."""
+        return self._memory is not None
+
+    def offer(self, navigator: Navigator, stamp: int) -> None:
+        """Give the estimator what the last run knew, if that is not too old at the first IMU sample (ns)."""
+        assert self._memory is not None
+        age = (stamp - self._memory.stamp) / SECOND
+        if 0.0 <= age <= self._parameters.max_age:
+            navigator.warm_start(self._memory, age)
+            self._logger.info(f"warm start from what was known {age:.0f} s ago")
+        else:
+            self._logger.info(f"the warm start file is {age:.0f} s old and is not used (warm_start.max_age)")
+        self._memory = None
+
+    def write(self, navigator: Navigator) -> None:
+        """Write what is known now to the file, if there is one."""
+        if self._parameters.file and navigator.memory is not None:
+            write_memory(Path(self._parameters.file).expanduser(), navigator.memory)

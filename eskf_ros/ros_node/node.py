@@ -6,7 +6,6 @@ import gc
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,6 @@ from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
 
 from eskf_ros.compiled import sentence_on_compiling, while_compiling
-from eskf_ros.filter.alignment.warm_start import Memory
 from eskf_ros.filter.navigator import ORIENTATION_SHARE, Navigator
 from eskf_ros.filter.state.enums import STREAM_NAMES, Status, Stream, Verdict
 from eskf_ros.gnss.rinex import RinexError
@@ -33,10 +31,10 @@ from eskf_ros.ros_node import robot_localization, transforms
 from eskf_ros.ros_node.cdr import ImuReader, ImuSample, imu_from_message
 from eskf_ros.ros_node.clocks import SECOND, Stamp, StampMonitor
 from eskf_ros.ros_node.declare import LiveParameters, declare, unused_overrides
-from eskf_ros.ros_node.diagnostics import status_report
+from eskf_ros.ros_node.diagnostics import Snapshot, status_report
 from eskf_ros.ros_node.error_counter import Trouble
 from eskf_ros.ros_node.extrinsics import IMU, Extrinsics, place_of
-from eskf_ros.ros_node.memory import read_memory, write_memory
+from eskf_ros.ros_node.memory import WarmStart
 from eskf_ros.ros_node.messages import bias_message, fix_message, record_statuses, solution_message
 from eskf_ros.ros_node.publishers import OUTPUT_QOS, OVERRIDING, Outputs
 from eskf_ros.ros_node.set_pose import set_pose
@@ -79,7 +77,7 @@ class EskfNode(Node):
         self._is_judging = False
         self._is_simulated = bool(self.get_parameter("use_sim_time").value)
         self._reports = 0
-        self._memory = self._read_memory()
+        self._warm_start = WarmStart(self.parameters.warm_start, self.get_logger())
         self._compile()
         self._live = LiveParameters(self, self.parameters, self._configure)
 
@@ -135,7 +133,7 @@ class EskfNode(Node):
     def close(self) -> None:
         """Publish the last report and write the warm start file; called while the publishers still work."""
         self._contained(self._report, "report")()
-        self._contained(self._write_memory, "warm_start.file")()
+        self._contained(partial(self._warm_start.write, self.navigator), "warm_start.file")()
 
     def _compile(self) -> None:
         """Have every kernel compiled before the first message comes: from the cache, or anew for a minute."""
@@ -223,8 +221,8 @@ class EskfNode(Node):
             self._meet_frame(self._imu_frames_met, frame, IMU, self._imu_frame)
         if judgement == Stamp.ZERO:
             return
-        if self._memory is not None:
-            self._offer_memory(stamp)
+        if self._warm_start.is_waiting:
+            self._warm_start.offer(self.navigator, stamp)
         if self.parameters.alignment.imu_orientation != "unused" and stamp % SECOND < ORIENTATION_SHARE:
             self._push_orientation(stamp, deserialize_message(data, Imu))
         rows = self.navigator.push_imu(np.array([stamp]), np.array([specific_force]), np.array([angular_rate]))
@@ -312,12 +310,36 @@ class EskfNode(Node):
         if self.navigator.restarts > self._restarts:
             self.get_logger().warn("the alignment began again: the IMU was silent, or fix after fix was rejected")
         self._restarts = self.navigator.restarts
-        self._diagnostics.publish(status_report(self, stamp))
+        self._diagnostics.publish(status_report(self._snapshot(), stamp))
         if self.range_intake is not None:
             self.range_intake.wants_solution = self._solutions.get_subscription_count() > 0
         self.callbacks, self.callback_time, self.longest_callback = 0, 0.0, 0.0
         self._watch_transforms()
         self._reports += 1
+
+    def _snapshot(self) -> Snapshot:
+        """What the diagnostics look at."""
+        return Snapshot(
+            graph=self,
+            now=self.now(),
+            navigator=self.navigator,
+            parameters=self.parameters,
+            imu_monitor=self.imu_monitor,
+            aid_inputs=self.aid_inputs,
+            inputs=self.inputs,
+            output_publishers=self.output_publishers,
+            outputs=self.outputs,
+            range_intake=self.range_intake,
+            position_stream=self.position_stream,
+            latest_positions=self.latest_positions,
+            verdicts=self.verdicts,
+            trouble=self.trouble,
+            extrinsics=self.extrinsics,
+            resets=self.resets,
+            callbacks=self.callbacks,
+            callback_time=self.callback_time,
+            longest_callback=self.longest_callback,
+        )
 
     def _count(self, records: np.ndarray) -> None:
         """Count final verdicts by stream, those of the last fixes or pseudoranges apart."""
@@ -406,32 +428,6 @@ class EskfNode(Node):
             self._configure(self._live.current)
             if is_late and self.navigator.status > Status.LEVELLING:
                 self._reset("the place of a sensor has become known")
-
-    def _read_memory(self) -> Memory | None:
-        path = self.parameters.warm_start.file
-        if not path:
-            return None
-        try:
-            return read_memory(Path(path).expanduser())
-        except ValueError as error:
-            self.get_logger().warn(f"warm_start.file: {error}; starting without it")
-            return None
-
-    def _offer_memory(self, stamp: int) -> None:
-        """Give the estimator what the last run knew, if that is not too old at the first IMU sample."""
-        assert self._memory is not None
-        age = (stamp - self._memory.stamp) / SECOND
-        if 0.0 <= age <= self.parameters.warm_start.max_age:
-            self.navigator.warm_start(self._memory, age)
-            self.get_logger().info(f"warm start from what was known {age:.0f} s ago")
-        else:
-            self.get_logger().info(f"the warm start file is {age:.0f} s old and is not used (warm_start.max_age)")
-        self._memory = None
-
-    def _write_memory(self) -> None:
-        path, memory = self.parameters.warm_start.file, self.navigator.memory
-        if path and memory is not None:
-            write_memory(Path(path).expanduser(), memory)
 
 
 def input_qos(depth: int) -> QoSProfile:
