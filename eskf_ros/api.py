@@ -38,10 +38,12 @@ from numpy.typing import NDArray
 
 from eskf_ros.filter.history.records import RECORD
 from eskf_ros.filter.history.timeline import EARLY_AIDS, JUMP_CONFIRMATIONS, LARGEST_JUMP
+from eskf_ros.filter.measurements.row import UNMEASURED
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.output.global_odometry import ODOMETRY
 from eskf_ros.filter.rows import ROWS
 from eskf_ros.filter.state.enums import CONSTRAINTS, STREAM_NAMES, Stream, Verdict
+from eskf_ros.filter.state.time import SECOND
 from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.parameters.ros_yaml import load
 from eskf_ros.parameters.tree import Parameters
@@ -53,9 +55,7 @@ __all__ = ["Filter", "Result", "run"]
 
 ParametersLike = str | PathLike[str] | Parameters | Mapping[str, object] | None
 
-SECOND = 1_000_000_000
 LARGEST_CHUNK = 1024
-UNMEASURED = -1.0
 
 
 DROPS = {

@@ -9,7 +9,8 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-SECOND = 1_000_000_000
+from eskf_ros.filter.state.time import SECOND
+
 MEMORY = 100
 """Messages over which delay and rate are taken."""
 

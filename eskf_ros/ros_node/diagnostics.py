@@ -18,12 +18,13 @@ from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.rows import SENSORS as ROWS_OF_SENSORS
 from eskf_ros.filter.state.enums import STREAM_NAMES, Phase, Status, Stream, Verdict
 from eskf_ros.filter.state.error_state import SOURCES
+from eskf_ros.filter.state.time import SECOND
 from eskf_ros.filter.tight.signal import name_of
 from eskf_ros.gnss.signals import BEIDOU_3, Gnss
 from eskf_ros.inputs.epochs import RangeIntake
 from eskf_ros.inputs.table import Input
 from eskf_ros.parameters.tree import Parameters
-from eskf_ros.ros_node.clocks import SECOND, StampMonitor, clock_complaints
+from eskf_ros.ros_node.clocks import StampMonitor, clock_complaints
 from eskf_ros.ros_node.error_counter import Trouble
 from eskf_ros.ros_node.extrinsics import Extrinsics
 from eskf_ros.ros_node.messages import key_values

@@ -12,11 +12,10 @@ from geometry_msgs.msg import TwistWithCovarianceStamped
 from sensor_msgs.msg import NavSatFix, NavSatStatus
 
 from eskf_ros.filter.state.enums import STREAM_NAMES, Stream, Verdict
+from eskf_ros.filter.state.time import SECOND
 from eskf_ros.filter.tight.signal import name_of
 from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.gnss.point_solution import PointSolution, SolutionStatus
-
-SECOND = 1_000_000_000
 
 GOOD_VERDICTS = (Verdict.FUSED, Verdict.WEIGHED_DOWN, Verdict.DUPLICATE, Verdict.DISABLED)
 """Nothing is wrong with what got one of these."""

@@ -22,6 +22,7 @@ from std_srvs.srv import Trigger
 from eskf_ros.compiled import sentence_on_compiling, while_compiling
 from eskf_ros.filter.navigator import ORIENTATION_SHARE, Navigator
 from eskf_ros.filter.state.enums import STREAM_NAMES, Status, Stream, Verdict
+from eskf_ros.filter.state.time import SECOND
 from eskf_ros.gnss.rinex import RinexError
 from eskf_ros.inputs.epochs import RangeIntake
 from eskf_ros.inputs.table import Input, uses_ranges
@@ -29,7 +30,7 @@ from eskf_ros.parameters.schema import ParameterError
 from eskf_ros.parameters.tree import Parameters
 from eskf_ros.ros_node import robot_localization, transforms
 from eskf_ros.ros_node.cdr import ImuReader, ImuSample, imu_from_message
-from eskf_ros.ros_node.clocks import SECOND, Stamp, StampMonitor
+from eskf_ros.ros_node.clocks import Stamp, StampMonitor
 from eskf_ros.ros_node.declare import LiveParameters, declare, unused_overrides
 from eskf_ros.ros_node.diagnostics import Snapshot, status_report
 from eskf_ros.ros_node.error_counter import Trouble

@@ -10,10 +10,11 @@ import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 
 from eskf_ros.bags import Batch, StringTable, decode
+from eskf_ros.filter.state.time import SECOND
 from eskf_ros.inputs.table import Arguments, Input, inputs_of, time_offset_of
 from eskf_ros.parameters.schema import ParameterError
 from eskf_ros.parameters.tree import Parameters
-from eskf_ros.ros_node.clocks import SECOND, StampMonitor
+from eskf_ros.ros_node.clocks import StampMonitor
 
 
 def message_class(type_name: str) -> Any:

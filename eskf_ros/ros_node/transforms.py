@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from eskf_ros.filter.state.time import SECOND
 from eskf_ros.parameters.tree import Frames
 
 try:
@@ -19,7 +20,6 @@ try:
 except ImportError:
     TFMessage = None
 
-SECOND = 1_000_000_000
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.api import SECOND
+from eskf_ros.filter.state.time import SECOND
 
 Array = NDArray[np.float64]
 
