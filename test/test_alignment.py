@@ -27,7 +27,7 @@ from eskf_ros.filter.alignment import heading as heading_start
 from eskf_ros.filter.history.records import AID
 from eskf_ros.filter.inertial import navigation_frame
 from eskf_ros.filter.inertial.strapdown import gravity_map
-from eskf_ros.filter.integrity.restart import restart
+from eskf_ros.filter.integrity.restart import reset_alignment
 from eskf_ros.filter.layout import blank_state
 from eskf_ros.filter.loop import update_rest
 from eskf_ros.filter.measurements import gnss_position
@@ -464,7 +464,7 @@ def test_restart_while_standing_still_counts_from_zero() -> None:
     force, rate = at_rest(state, Rotation.identity(), np.zeros(3), bias)
     watch(state, settings, 20.5, force, rate)
     np.testing.assert_allclose(state["gyro_bias"], bias, rtol=0.0, atol=1e-4)
-    restart(state)
+    reset_alignment(state)
     state["stamp"] += 6_000_000_000
     watch(state, settings, 2.5, force, rate)
     assert state["level_known"] == 1
@@ -480,7 +480,7 @@ def test_restart_under_way_does_not_know_the_heading_of_the_start() -> None:
     watch(state, settings, 2.5, force, rate)
     assert state["heading_known"] == 1
     state["attitude"] = to_quaternion(Rotation.from_euler("z", 170.0, degrees=True))
-    restart(state)
+    reset_alignment(state)
     state["stamp"] += 6_000_000_000
     watch(state, settings, 2.5, force, rate)
     assert state["heading_known"] == 0 or core(state)[8, 8] > 0.5

@@ -36,7 +36,7 @@ def running(seed: int, far: float) -> Any:
     state = random_state(seed, far)
     x, y, _ = state["position_map"]
     state["position_map"][2] = -(x**2 + y**2) / (2.0 * 6.37e6) + 50.0
-    augmented_states.join(state, SETTINGS["reach"][Stream.BARO], SETTINGS)
+    augmented_states.update_error_size(state, SETTINGS["reach"][Stream.BARO], SETTINGS)
     rng = np.random.default_rng(seed)
     state["optional"][OFFSET - ERROR_SIZE] = rng.normal(0.0, 100.0)
     state["optional"][SCALE - ERROR_SIZE] = rng.normal(0.0, 0.05)

@@ -208,7 +208,7 @@ class FrozenGain:
             for block in (ACCEL_BIAS, GYRO_BIAS):
                 correction[block : block + 3] = body_to_map.T @ correction[block : block + 3]
             self.work["correction"][:15] = correction
-            kalman_update.inject(self.state, self.work["correction"])
+            kalman_update.update_nominal_state(self.state, self.work["correction"])
 
     def optimal_gain(self, body_to_map: np.ndarray) -> np.ndarray:
         """The Kalman gain of what was just linearised, (15, 3), the rows of the biases in map axes."""

@@ -48,7 +48,7 @@ def moving(seed: int, settings: Any = SETTINGS) -> Any:
     """Return a running filter at a grid point, in motion, with whatever optional states the wheels need."""
     state = random_state(seed)
     rng = np.random.default_rng(seed)
-    augmented_states.join(state, settings["reach"][Stream.WHEEL], settings)
+    augmented_states.update_error_size(state, settings["reach"][Stream.WHEEL], settings)
     if state["error_size"] > ERROR_SIZE:
         state["optional"][:3] = rng.normal(0.0, (0.1, 0.1, 0.05))
     state["rest"]["block_end"] = state["stamp"]

@@ -98,7 +98,7 @@ def test_the_innovation_is_the_short_way_round(turns: float, off: float) -> None
 def test_the_offset_is_in_yaw_alone() -> None:
     state, plain, work = levelled(1, 0.0), make_work(), make_work()
     heading.linearize(state, payload(0.3, 0.1, (1e-4, 4e-4)), 0, SETTINGS, plain)
-    augmented_states.join(state, SETTINGS["reach"][Stream.HEADING], SETTINGS)
+    augmented_states.update_error_size(state, SETTINGS["reach"][Stream.HEADING], SETTINGS)
     place = int(SETTINGS["heading_offset_at"])
     state["optional"][place - ERROR_SIZE] = 0.02
     heading.linearize(state, payload(0.3, 0.1, (1e-4, 4e-4)), 0, SETTINGS, work)

@@ -54,7 +54,7 @@ needs_model = pytest.mark.skipif(not installed(), reason="pygeomag is not instal
 def in_the_field(seed: int, far: float, with_model: bool = True) -> tuple[Any, Array]:
     """Return a running filter in a magnetic field and the payload of an error-free reading, by way of pymap3d."""
     state = random_state(seed, far)
-    augmented_states.join(state, SETTINGS["reach"][Stream.MAG], SETTINGS)
+    augmented_states.update_error_size(state, SETTINGS["reach"][Stream.MAG], SETTINGS)
     rng = np.random.default_rng(seed)
     state["optional"][ERROR - ERROR_SIZE] = rng.normal(0.0, 0.05)
     state["optional"][IRON - ERROR_SIZE : IRON - ERROR_SIZE + 3] = rng.normal(0.0, 3e-6, 3)

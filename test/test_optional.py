@@ -44,7 +44,7 @@ STDS = np.concatenate([USUAL_STDS, [1.0, 1.0, 1.0]])
 def joined(seed: int) -> Any:
     """Return a running filter with the lasting position error in use, all of it correlated."""
     state = random_state(seed)
-    augmented_states.join(state, LASTING["reach"][Stream.GNSS_POSITION], LASTING)
+    augmented_states.update_error_size(state, LASTING["reach"][Stream.GNSS_POSITION], LASTING)
     state["covariance"][:SIZE, :SIZE] = random_covariance(seed, STDS)
     state["optional"][:3] = np.random.default_rng(seed).normal(size=3)
     return state
@@ -62,7 +62,7 @@ def test_joining_gives_the_first_variance_and_no_correlation() -> None:
     core(state)[:] = random_covariance(1, USUAL_STDS)
     state["covariance"][15:] = state["covariance"][:, 15:] = 7.0
     before = copy_of(state)
-    augmented_states.join(state, SIZE, LASTING)
+    augmented_states.update_error_size(state, SIZE, LASTING)
     assert state["error_size"] == SIZE
     np.testing.assert_array_equal(core(state), core(before))
     np.testing.assert_array_equal(state["covariance"][15:SIZE, :SIZE], np.eye(3, SIZE, 15))
@@ -70,7 +70,7 @@ def test_joining_gives_the_first_variance_and_no_correlation() -> None:
     core(state)[0, 0] = 5.0
     state["covariance"][15, 0] = state["covariance"][0, 15] = 0.3
     again = copy_of(state)
-    augmented_states.join(state, SIZE, LASTING)
+    augmented_states.update_error_size(state, SIZE, LASTING)
     assert state.tobytes() == again.tobytes()
 
 
@@ -115,7 +115,7 @@ def test_propagation_is_the_dense_product(seed: int, dt: float) -> None:
 
 def test_what_lasts_keeps_its_variance_and_forgets_in_its_time() -> None:
     state = make_state()
-    augmented_states.join(state, SIZE, LASTING)
+    augmented_states.update_error_size(state, SIZE, LASTING)
     # How it starts shows in what it has in common with the position.
     state["covariance"][0, 15] = state["covariance"][15, 0] = 0.5
     for _ in range(round(TIME / 0.02)):

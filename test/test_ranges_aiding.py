@@ -57,7 +57,7 @@ arms = pytest.mark.parametrize("settings", [SETTINGS, LONG_ARM], ids=["short", "
 def tight_state(seed: int, far: float = 3000.0) -> Any:
     """Return a running filter in which the clock and all offsets are in use."""
     state = random_state(seed, far)
-    augmented_states.join(state, SIZE, SETTINGS)
+    augmented_states.update_error_size(state, SIZE, SETTINGS)
     rng = np.random.default_rng(seed)
     state["optional"][CLOCK - ERROR_SIZE : SIZE - ERROR_SIZE] = rng.normal(0.0, 30.0, SIZE - CLOCK)
     return state
@@ -231,7 +231,7 @@ def test_each_constellation_has_an_offset_of_its_own_and_gps_none() -> None:
 def test_what_lasts_moves_the_antenna_that_the_satellites_see(seed: int) -> None:
     """By its standard deviations times the state; its columns are those of the position times those."""
     state, work, plain = random_state(seed), make_work(), make_work()
-    augmented_states.join(state, LASTING["reach"][Stream.PSEUDORANGE], LASTING)
+    augmented_states.update_error_size(state, LASTING["reach"][Stream.PSEUDORANGE], LASTING)
     place = int(LASTING["position_error_at"])
     payload = signal_payload(state, seed)
     pseudorange.linearize(state, payload, GPS, LASTING, plain)
@@ -267,7 +267,7 @@ def test_clock_between_epochs(steps: int) -> None:
     )
     state = random_state(5)
     size = CLOCK + 2
-    augmented_states.join(state, size, settings)
+    augmented_states.update_error_size(state, size, settings)
     stds = np.concatenate([np.repeat([2.0, 0.3, 0.02, 0.1, 0.003], 3), np.full(CLOCK - ERROR_SIZE, 1.0), [20.0, 0.5]])
     state["covariance"][:size, :size] = random_covariance(5, stds)
     state["optional"][CLOCK - ERROR_SIZE : size - ERROR_SIZE] = 100.0, -7.0

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from eskf_ros.filter.measurements.kalman_update import inject, invert_positive, update
+from eskf_ros.filter.measurements.kalman_update import invert_positive, update, update_nominal_state
 from eskf_ros.filter.state.enums import Stream, Verdict
 
 Array = NDArray[np.float64]
@@ -123,7 +123,7 @@ def test_injection_is_the_error_definition(seed: int) -> None:
     state = random_state(seed % 1000)
     correction = np.random.default_rng(seed).normal(size=15) * np.repeat([5.0, 1.0, 0.5, 0.1, 0.01], 3)
     expected = with_error(state, correction)
-    inject(state, correction)
+    update_nominal_state(state, correction)
     for name in ("position_map", "velocity_map", "accel_bias", "gyro_bias"):
         np.testing.assert_allclose(state[name], expected[name], rtol=0.0, atol=1e-12)
     assert (to_rotation(state["attitude"]) * to_rotation(expected["attitude"]).inv()).magnitude() < 1e-14

@@ -29,7 +29,7 @@ from eskf_ros.filter.measurements import (
 from eskf_ros.filter.measurements.kalman_update import update
 from eskf_ros.filter.measurements.row import NEEDS_FIELD, NEEDS_HEADING, NEEDS_POSITION
 from eskf_ros.filter.output.local_odometry import note_jump
-from eskf_ros.filter.state.augmented_states import join
+from eskf_ros.filter.state.augmented_states import update_error_size
 from eskf_ros.filter.state.enums import SENSOR_STREAMS, Stream, Verdict
 from eskf_ros.filter.stationarity.detector import update_rest_evidence, watch_wheels
 from eskf_ros.filter.stationarity.static_window import update_evidence_from_fix, update_evidence_from_velocity
@@ -77,7 +77,7 @@ def offer(state, aid, heading_before, settings, work):
         # It is made of the same IMU: good for a start, and nothing new afterwards.
         aid.verdict = Verdict.INACTIVE
         return
-    join(state, settings.reach[aid.stream], settings)
+    update_error_size(state, settings.reach[aid.stream], settings)
     reset_for_new_solution(state, aid, settings)
     size = measure(state, aid, heading_before, settings, work)
     if size == 0:

@@ -8,7 +8,7 @@ from eskf_ros.filter.fuse import fuse
 from eskf_ros.filter.history.timeline import rewind, save_checkpoint
 from eskf_ros.filter.inertial.navigation_frame import heading_of
 from eskf_ros.filter.integrity.imu_monitor import watch_input
-from eskf_ros.filter.integrity.restart import restart
+from eskf_ros.filter.integrity.restart import reset_alignment
 from eskf_ros.filter.output.global_odometry import write_odometry
 from eskf_ros.filter.output.local_odometry import carry, measure_step, note_jump
 from eskf_ros.filter.predict import propagate
@@ -68,7 +68,7 @@ def predict(state, stamp, sample, settings, work):
         return
     if sample.stamp - state.imu.stamp > LONGEST_GAP:
         position = (state.position_map[0], state.position_map[1], state.position_map[2])
-        restart(state)
+        reset_alignment(state)
         note_jump(state, position, heading_of(state, settings), settings)
         return
     propagate(state, stamp, sample, settings, work)

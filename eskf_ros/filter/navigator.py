@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from eskf_ros.filter.alignment.first_fix import place
+from eskf_ros.filter.alignment.first_fix import reset_pose
 from eskf_ros.filter.alignment.heading_search import forget_search
 from eskf_ros.filter.alignment.warm_start import Memory
 from eskf_ros.filter.history.admission import ABSENT, admit
@@ -21,7 +21,7 @@ from eskf_ros.filter.history.timeline import (
     raise_barrier,
     take_final,
 )
-from eskf_ros.filter.inertial.navigation_frame import heading_of, move_datum, set_datum
+from eskf_ros.filter.inertial.navigation_frame import heading_of, reset_datum, set_datum
 from eskf_ros.filter.integrity.fix_tracker import forget_tracks
 from eskf_ros.filter.integrity.traffic import Traffic
 from eskf_ros.filter.layout import STATE, WORK, blank_state
@@ -133,7 +133,7 @@ class Navigator(Readout):
         position, heading = tuple(state["position_map"]), heading_of(state, settings)
         datum = math.radians(latitude_deg), math.radians(longitude_deg), float(altitude)
         if state["position_known"]:
-            move_datum(state, *datum, settings)
+            reset_datum(state, *datum, settings)
             forget_search(state)
             forget_tracks(state)
             note_jump(state, position, heading, settings)
@@ -154,7 +154,9 @@ class Navigator(Readout):
             return False
         before, heading_before = tuple(state["position_map"]), heading_of(state, settings)
         covariance = np.ascontiguousarray(position_covariance, np.float64)
-        place(state, tuple(float(v) for v in position_map), covariance, float(heading), float(heading_std), settings)
+        reset_pose(
+            state, tuple(float(v) for v in position_map), covariance, float(heading), float(heading_std), settings
+        )
         forget_tracks(state)
         note_jump(state, before, heading_before, settings)
         self._raise_barrier()

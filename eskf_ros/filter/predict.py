@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.heading_search import predict_search
-from eskf_ros.filter.inertial.covariance import add_noise, propagate_covariance
+from eskf_ros.filter.inertial.covariance import propagate_covariance, propagate_noise
 from eskf_ros.filter.inertial.strapdown import propagate_nominal_state
 from eskf_ros.filter.state import augmented_states
 from eskf_ros.filter.state.error_state import ERROR_SIZE
@@ -38,7 +38,7 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
         velocity_noise += WANDER_TIME * (WANDER_ACCELERATION**2 + dot(acceleration, acceleration))
     size = state.error_size
     propagate_covariance(state.covariance, size, middle, force, gravity, state.frame.earth_rate_map, dt, coupling, work)
-    add_noise(state.covariance, velocity_noise, attitude_noise, dt, settings)
+    propagate_noise(state.covariance, velocity_noise, attitude_noise, dt, settings)
     if size > ERROR_SIZE:
         augmented_states.propagate_augmented(state, dt, settings)
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.heading import reset_heading
 from eskf_ros.filter.alignment.heading_search import forget_search
-from eskf_ros.filter.inertial.navigation_frame import local_up, set_datum, shortest_turn, turn_attitude
+from eskf_ros.filter.inertial.navigation_frame import local_up, reset_attitude, set_datum, shortest_turn
 from eskf_ros.filter.measurements.gnss_position import position_of_fix
 from eskf_ros.filter.state.error_state import ERROR_CAPACITY, POSITION, VELOCITY
 from eskf_ros.geodesy.rotation import rotate, rotate_back, to_matrix
@@ -41,12 +41,12 @@ def reset_position_to_fix(state, payload):
     for i in range(3):
         covariance[POSITION + i, POSITION + i] = START_POSITION_STD**2
         covariance[VELOCITY + i, VELOCITY + i] = START_VELOCITY_STD**2
-    turn_attitude(state, shortest_turn(old_up, local_up(state)))
+    reset_attitude(state, shortest_turn(old_up, local_up(state)))
     state.position_known = 1
 
 
 @njit
-def place(state, position, position_covariance, heading, heading_std, settings):
+def reset_pose(state, position, position_covariance, heading, heading_std, settings):
     """Put base_link to a position (m, map) with a covariance (3, 3) and a heading (rad), whatever was known before."""
     covariance = state.covariance
     for i in range(3):

@@ -6,13 +6,13 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.heading_search import COSINE, begin_search, spread, turn_found, update_search
-from eskf_ros.filter.inertial.covariance import transform_error
+from eskf_ros.filter.inertial.covariance import update_error_axes
 from eskf_ros.filter.inertial.navigation_frame import (
     body_rate,
     heading_of,
     local_east_north_up_to_ecef,
     local_up,
-    turn_attitude,
+    reset_attitude,
 )
 from eskf_ros.filter.measurements.gnss_position import position_of_fix
 from eskf_ros.filter.measurements.jacobians import set_east_north_up_covariance
@@ -37,7 +37,7 @@ def reset_heading(state, heading, std, settings):
     up = local_up(state)
     lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[0])
     change = heading - heading_of(state, settings)
-    turn_attitude(state, (change * up[0], change * up[1], change * up[2]))
+    reset_attitude(state, (change * up[0], change * up[1], change * up[2]))
     # The vehicle did not make this turn.
     state.mag.heading = wrapped(state.mag.heading + change)
     covariance = state.covariance
@@ -46,7 +46,7 @@ def reset_heading(state, heading, std, settings):
         (-up[1] * up[0], 1.0 - up[1] * up[1], -up[1] * up[2]),
         (-up[2] * up[0], -up[2] * up[1], 1.0 - up[2] * up[2]),
     )
-    transform_error(covariance, ATTITUDE, across)
+    update_error_axes(covariance, ATTITUDE, across)
     for i in range(3):
         for j in range(3):
             covariance[ATTITUDE + i, ATTITUDE + j] += up[i] * up[j] * std**2

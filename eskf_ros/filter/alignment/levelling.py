@@ -10,7 +10,7 @@ from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.heading import reset_heading
 from eskf_ros.filter.alignment.heading_search import note_level
 from eskf_ros.filter.alignment.warm_start import do_biases_hold
-from eskf_ros.filter.inertial.navigation_frame import heading_of, local_up, shortest_turn, turn_attitude
+from eskf_ros.filter.inertial.navigation_frame import heading_of, local_up, reset_attitude, shortest_turn
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_CAPACITY, ERROR_SIZE, GYRO_BIAS
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity.residual_motion import can_be_bias, is_moving, note_sway
@@ -68,7 +68,7 @@ def level(state, sums, count, interval, is_rest, settings):
     heading = heading_of(state, settings)
     up = local_up(state)
     measured = rotate(to_matrix(state.attitude), (force[0] / strength, force[1] / strength, force[2] / strength))
-    turn_attitude(state, shortest_turn(measured, up))
+    reset_attitude(state, shortest_turn(measured, up))
     reset_tilt(state, up, strength, accel_bias, accel_variance, tilt_noise, settings)
     update_gyro_bias_at_rest(state, gyro_bias, gyro_variance, rate, up, duration, is_rest, settings)
     # The parameter is true of the start only, not of where a restart finds the robot.

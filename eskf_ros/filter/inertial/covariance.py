@@ -87,7 +87,7 @@ def apply_transition(columns, out, count, rotation, force, up, gravity_gradient,
 
 
 @njit
-def add_noise(covariance, velocity_noise, attitude_noise, dt, settings):
+def propagate_noise(covariance, velocity_noise, attitude_noise, dt, settings):
     """Add ``dt`` s of process noise; velocity (m2/s3) and attitude (rad2/s) noise are spectral densities."""
     for i in range(3):
         p, v, t, a, g = i, 3 + i, 6 + i, 9 + i, 12 + i
@@ -131,7 +131,7 @@ def propagate_covariance(covariance, size, rotation, force, gravity, earth_rate,
 
 
 @njit
-def transform_error(covariance, block, matrix):
+def update_error_axes(covariance, block, matrix):
     """Replace the three errors from index ``block`` by ``matrix`` (3x3 row tuples) times themselves."""
     for j in range(len(covariance)):
         error = rotate(matrix, (covariance[block, j], covariance[block + 1, j], covariance[block + 2, j]))

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.inertial.covariance import transform_error
+from eskf_ros.filter.inertial.covariance import update_error_axes
 from eskf_ros.filter.inertial.strapdown import gravity_map
 from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, POSITION, VELOCITY
 from eskf_ros.geodesy.earth import EARTH_RATE, east_north_up_to_ecef, ecef_to_geodetic, geodetic_to_ecef
@@ -65,18 +65,18 @@ def local_up(state):
 
 
 @njit
-def turn_attitude(state, rotation_vector):
+def reset_attitude(state, rotation_vector):
     """Turn the attitude by a rotation vector in map axes, and its error with it (the error is in map axes too)."""
     turn = from_rotation_vector(rotation_vector)
     attitude = (state.attitude[0], state.attitude[1], state.attitude[2], state.attitude[3])
     attitude = normalized(multiply(turn, attitude))
     for i in range(4):
         state.attitude[i] = attitude[i]
-    transform_error(state.covariance, ATTITUDE, to_matrix(turn))
+    update_error_axes(state.covariance, ATTITUDE, to_matrix(turn))
 
 
 @njit
-def move_datum(state, latitude, longitude, altitude, settings):
+def reset_datum(state, latitude, longitude, altitude, settings):
     """Describe the same state in the local frame of another datum (rad, rad, m): an exact rotation and shift."""
     old = east_north_up_to_ecef(state.frame.datum[0], state.frame.datum[1])
     offset = rotate(old, state.position_map)
@@ -97,14 +97,14 @@ def move_datum(state, latitude, longitude, altitude, settings):
     for i in range(3):
         state.position_map[i] = position[i]
         state.velocity_map[i] = velocity[i]
-    transform_error(state.covariance, POSITION, turn)
-    transform_error(state.covariance, VELOCITY, turn)
+    update_error_axes(state.covariance, POSITION, turn)
+    update_error_axes(state.covariance, VELOCITY, turn)
     place = settings.position_error_at
     if place < state.error_size:
-        transform_error(state.covariance, place, turn)
+        update_error_axes(state.covariance, place, turn)
         lasting = state.optional[place - ERROR_SIZE : place - ERROR_SIZE + 3]
         lasting[0], lasting[1], lasting[2] = rotate(turn, (lasting[0], lasting[1], lasting[2]))
-    turn_attitude(state, to_rotation_vector(from_matrix(turn)))
+    reset_attitude(state, to_rotation_vector(from_matrix(turn)))
 
 
 @njit

@@ -26,7 +26,7 @@ from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.first_fix import START_VELOCITY_STD
 from eskf_ros.filter.alignment.heading_sensors import reset_given_heading, update_refutation
 from eskf_ros.filter.integrity.fix_tracker import is_contradicted, is_fusing, is_live, offset_of_track, patience
-from eskf_ros.filter.integrity.restart import restart
+from eskf_ros.filter.integrity.restart import reset_alignment
 from eskf_ros.filter.measurements.kalman_update import project, update
 from eskf_ros.filter.state.augmented_states import reset_augmented
 from eskf_ros.filter.state.enums import SENSOR_STREAMS, Phase, Stream, Verdict
@@ -137,7 +137,7 @@ def recover(state, aid, size, gate, settings, work):
         aid.verdict = Verdict.CONTRADICTED
     elif stream == Stream.GNSS_POSITION and aid.verdict == Verdict.GATE:
         if has_won(state, source):
-            reset(state, source, settings, work)
+            reset_to_fixes(state, source, settings, work)
             aid.verdict = Verdict.RESET
         elif aid.nis <= NEAR_GATE * gate:
             update_weighed_down(state, size, aid.nis / gate, work)
@@ -146,7 +146,7 @@ def recover(state, aid, size, gate, settings, work):
         if reset_given_heading(state, aid, settings, work):
             aid.verdict = Verdict.RESET
         else:
-            restart(state)
+            reset_alignment(state)
     elif stream == Stream.HEADING and aid.verdict == Verdict.FUSED:
         state.heading.disputed = 0
     is_lasting = state.stamp - state.streams.fused_stamp[stream, source] > REJECTED_PRESSURE
@@ -154,7 +154,7 @@ def recover(state, aid, size, gate, settings, work):
         reset_augmented(state, settings.baro_offset_at, 1, settings)
     note(state, stream, source, aid.verdict)
     if stream == Stream.GNSS_POSITION and is_lost(state):
-        restart(state)
+        reset_alignment(state)
 
 
 @njit
@@ -162,7 +162,7 @@ def note_epoch(state, verdict):
     """Note what became of most pseudoranges of an epoch."""
     note(state, Stream.PSEUDORANGE.value, 0, verdict)
     if is_lost(state):
-        restart(state)
+        reset_alignment(state)
 
 
 @njit
@@ -243,21 +243,21 @@ def is_against_inertial(state, source):
 
 
 @njit
-def reset(state, source, settings, work):
+def reset_to_fixes(state, source, settings, work):
     """Put position and velocity where the track of a receiver is; attitude and biases stay as they are.
 
     The position is no more certain than one fix: errors of fixes are alike. A velocity that agrees with the receiver's
     stays; if the receiver gives none it is that of the track, else it is open to the next one.
     """
     covariance = state.covariance
-    forget_error(covariance, POSITION)
+    reset_error(covariance, POSITION)
     # What lasts in the errors of fixes was taken out of the noise, and is in the position again.
     whole = 1.0 / (1.0 - settings.correlated_share) if settings.position_error_at < state.error_size else 1.0
     for i in range(3):
         state.position_map[i] += offset_of_track(state, source, i)
         covariance[POSITION + i, POSITION + i] = max(state.tracker.offset_variance[source, i], whole * work.noise[i, i])
     if not is_fusing(state, Stream.GNSS_VELOCITY.value, source):
-        forget_error(covariance, VELOCITY)
+        reset_error(covariance, VELOCITY)
         is_led = is_live(state, Stream.GNSS_VELOCITY.value, source)
         for i in range(3):
             p, v = POSITION + i, VELOCITY + i
@@ -276,7 +276,7 @@ def reset(state, source, settings, work):
 
 
 @njit
-def forget_error(covariance, place):
+def reset_error(covariance, place):
     """Take the correlations of three errors, and their variances."""
     for i in range(place, place + 3):
         for j in range(ERROR_CAPACITY):

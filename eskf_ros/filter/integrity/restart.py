@@ -9,7 +9,7 @@ from eskf_ros.filter.state.time import NEVER
 
 
 @njit
-def restart(state):
+def reset_alignment(state):
     """Start the alignment again; only the datum stays."""
     state.restarts += 1
     forget_search(state)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.inertial.covariance import transform_error
+from eskf_ros.filter.inertial.covariance import update_error_axes
 from eskf_ros.filter.state.enums import Verdict
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, VELOCITY
 from eskf_ros.geodesy.rotation import from_rotation_vector, left_jacobian, multiply, normalized
@@ -42,11 +42,11 @@ def update(state, size, gate, work):
             work.gain[i, a] = gain
             correction += gain * work.innovation[a]
         work.correction[i] = correction
-    joseph(state, size, work)
-    inject(state, work.correction)
+    update_covariance(state, size, work)
+    update_nominal_state(state, work.correction)
     # The error is now about the injected attitude (Sola, section 6.3.1, with the full Jacobian).
     turn = (work.correction[ATTITUDE], work.correction[ATTITUDE + 1], work.correction[ATTITUDE + 2])
-    transform_error(state.covariance, ATTITUDE, left_jacobian(turn))
+    update_error_axes(state.covariance, ATTITUDE, left_jacobian(turn))
     return Verdict.FUSED, nis
 
 
@@ -96,7 +96,7 @@ def invert_positive(matrix, size):
 
 
 @njit
-def joseph(state, size, work):
+def update_covariance(state, size, work):
     """Replace P by (I - K H) P (I - K H)' + K R K' - (I - K H) C K' - K C' (I - K H)', exactly symmetric."""
     covariance, n, gain = state.covariance, state.error_size, work.gain
     for i in range(n):
@@ -128,7 +128,7 @@ def joseph(state, size, work):
 
 
 @njit
-def inject(state, correction):
+def update_nominal_state(state, correction):
     """Move the error estimate into the nominal state (closed loop); the error state is zero afterwards."""
     for i in range(3):
         state.position_map[i] += correction[POSITION + i]

@@ -14,7 +14,7 @@ from eskf_ros.filter.state.error_state import ERROR_SIZE
 
 
 @njit
-def join(state, reach, settings):
+def update_error_size(state, reach, settings):
     """Take the optional states into use, so that ``reach`` errors are."""
     if reach > state.error_size:
         reset_augmented(state, state.error_size, reach - state.error_size, settings)
@@ -38,7 +38,7 @@ def propagate_augmented(state, dt, settings):
     """Let ``dt`` s pass for the optional states: they decay towards zero and become less certain."""
     covariance = state.covariance
     if settings.clock_at < state.error_size:
-        run_clock(state, settings.clock_at, dt, settings)
+        propagate_clock(state, settings.clock_at, dt, settings)
     for k in range(state.error_size - ERROR_SIZE):
         i = ERROR_SIZE + k
         if settings.optional_decay[k] > 0.0:
@@ -51,7 +51,7 @@ def propagate_augmented(state, dt, settings):
 
 
 @njit
-def run_clock(state, place, dt, settings):
+def propagate_clock(state, place, dt, settings):
     """Let ``dt`` s pass for the receiver's clock: the bias gains what the drift says, and what the drift gains.
 
     Two-state clock (Brown and Hwang, Introduction to Random Signals and Applied Kalman Filtering, section 9.3); the

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.state.augmented_states import join, reset_augmented
+from eskf_ros.filter.state.augmented_states import reset_augmented, update_error_size
 from eskf_ros.filter.state.enums import Verdict
 from eskf_ros.filter.state.error_state import ERROR_SIZE
 from eskf_ros.filter.tight.epoch_least_squares import OUTLIER, gather, median
@@ -76,8 +76,8 @@ def reset_or_jump_clock(state, aids, first, end, which, settings, work):
 @njit
 def join_offsets(state, aids, first, end, settings):
     """Take the clock into use, and the offsets of the constellations that are there."""
-    join(state, settings.clock_at + 2, settings)
+    update_error_size(state, settings.clock_at + 2, settings)
     for i in range(first, end):
         place = offset_place(system_of(aids[i].source), settings)
         if aids[i].verdict == Verdict.WAITING and place < len(state.covariance):
-            join(state, place + 1, settings)
+            update_error_size(state, place + 1, settings)
