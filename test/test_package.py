@@ -236,18 +236,3 @@ def test_only_the_simulator_imports_the_simulator():
             if any(name.startswith("eskf_ros.simulate") for name in names):
                 importers.append(source.relative_to(package).as_posix())
     assert not importers
-
-
-def test_functions_that_promise_to_look_do_not_write_the_state():
-    """``is_`` and ``has_`` in the filter: a reader may call them in any order."""
-    writers = []
-    for source in sorted((CHECKOUT / "eskf_ros" / "filter").rglob("*.py")):
-        for function in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
-            if not isinstance(function, ast.FunctionDef) or not function.name.startswith(("is_", "has_")):
-                continue
-            for node in ast.walk(function):
-                targets = [*node.targets] if isinstance(node, ast.Assign) else []
-                targets += [node.target] if isinstance(node, ast.AugAssign) else []
-                if any(ast.unparse(target).startswith("state.") for target in targets):
-                    writers.append(f"{source.name}: {function.name}")
-    assert not writers

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from enum import IntEnum
+from enum import IntEnum, auto
 
 
 class Status(IntEnum):
@@ -72,18 +72,18 @@ class Stream(IntEnum):
     """
 
     IMU = 0
-    GNSS_POSITION = 1
-    GNSS_VELOCITY = 2
-    HEADING = 3
-    MAG = 4
-    WHEEL = 5
-    BODY_VELOCITY = 6
-    BARO = 7
-    PSEUDORANGE = 8
-    RANGE_RATE = 9
-    ZUPT = 10
-    ZARU = 11
-    NHC = 12
+    GNSS_POSITION = auto()
+    GNSS_VELOCITY = auto()
+    HEADING = auto()
+    MAG = auto()
+    WHEEL = auto()
+    BODY_VELOCITY = auto()
+    BARO = auto()
+    PSEUDORANGE = auto()
+    RANGE_RATE = auto()
+    ZUPT = auto()
+    ZARU = auto()
+    NHC = auto()
 
 
 STREAM_NAMES = tuple(stream.name.lower() for stream in Stream)
@@ -91,7 +91,7 @@ STREAM_NAMES = tuple(stream.name.lower() for stream in Stream)
 CONSTRAINTS = (Stream.ZUPT, Stream.ZARU, Stream.NHC)
 
 SENSOR_STREAMS = int(min(CONSTRAINTS))
-"""So many streams, the first by rank, are those of sensors."""
+"""Number of the streams that sensors send, the IMU included; they have the lowest ranks."""
 
 CONSTRAINT_INTERVAL = 1_000_000_000
 """The grid of the constraints (ns).
