@@ -17,9 +17,14 @@ import numpy as np
 import pytest
 from kernels import core
 
-from eskf_ros.filter import fuse, layout, navigator, predict, settings
+from eskf_ros.filter import fuse, loop, predict, settings
+from eskf_ros.filter.navigator import Navigator
+from eskf_ros.filter.history.records import AID, IMU
+from eskf_ros.filter.layout import WORK
 from eskf_ros.filter.measurements import kalman_update
+from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, GYRO_BIAS
+from eskf_ros.filter.state.memory import allocate
 from eskf_ros.geodesy.rotation import to_matrix
 from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.scenario import SCENARIOS, Recording, simulate
@@ -160,11 +165,11 @@ class FrozenGain:
         self.recording = recording
         self.state = state
         self.settings = settings.settings_from(parameters)[0]
-        self.work = layout.allocate(layout.WORK)[0]
-        self.sample = layout.allocate(layout.IMU)[0]
+        self.work = allocate(WORK)[0]
+        self.sample = allocate(IMU)[0]
         self.next_imu = int(np.searchsorted(recording.imu_stamp, state["imu"]["stamp"])) + 1
         self.next_fix = int(np.searchsorted(recording.fix_stamp, state["stamp"]))
-        self.gains: dict[layout.Stream, np.ndarray] = {}
+        self.gains: dict[Stream, np.ndarray] = {}
 
     def run_to(self, stamp: int) -> None:
         """Use IMU and GNSS in the order of their stamps up to ``stamp``."""
@@ -182,7 +187,7 @@ class FrozenGain:
                 self.correct(self.next_fix)
                 self.next_fix += 1
             predict.propagate(self.state, recording.imu_stamp[i], self.sample, self.settings, self.work)
-            navigator.take_sample(self.state, self.sample)
+            loop.take_sample(self.state, self.sample)
             self.next_imu += 1
 
     def correct(self, k: int) -> None:
@@ -194,10 +199,10 @@ class FrozenGain:
             recording.fix_altitude[k],
         )
         for stream, values, covariance in (
-            (layout.Stream.GNSS_POSITION, geodetic, recording.fix_covariance[k]),
-            (layout.Stream.GNSS_VELOCITY, recording.velocity_enu[k], recording.velocity_covariance[k]),
+            (Stream.GNSS_POSITION, geodetic, recording.fix_covariance[k]),
+            (Stream.GNSS_VELOCITY, recording.velocity_enu[k], recording.velocity_covariance[k]),
         ):
-            aid = layout.allocate(layout.AID)[0]
+            aid = allocate(AID)[0]
             aid["stream"] = stream
             aid["payload"][:9] = np.concatenate([values, covariance[six]])
             fuse.linearize(self.state, aid, self.settings, self.work)
@@ -234,7 +239,7 @@ def test_a_gain_frozen_after_convergence_is_worse_through_a_tunnel_and_after_it(
         # Without latency the two see the same: the opponent works in the order of stamps.
         recording = simulate("drive", seed, outages=(tunnel,), latency=(0.0, 0.0))
         parameters = from_mapping({**recording.parameters(), **NO_SIDE_SLIP, **NO_REST})
-        estimator = navigator.Navigator(parameters)
+        estimator = Navigator(parameters)
         frozen = None
         stops = np.arange(round(frozen_at * 200) - 1, len(recording.imu_stamp), 1000)
         for i, state in feed(recording, estimator, stops):

@@ -454,7 +454,7 @@ def test_a_refused_stamp_is_not_counted():
         navigator.push_gnss_velocity(1.5, (0.0, 0.0, 0.0), GOOD_COVARIANCE)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="int64 nanoseconds"):
         navigator.push_ranges(1.5, (2300, 0.0), np.zeros(0, MEASURED_SIGNAL))  # type: ignore[arg-type]
-    assert not navigator._offered_count
+    assert not navigator._traffic.offered
 
 
 @pytest.mark.parametrize("stream", [stream for stream in Stream if stream != Stream.IMU])

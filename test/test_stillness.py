@@ -140,13 +140,13 @@ def test_how_quiet_rest_is_is_learnt_where_it_is_seen() -> None:
     state["rest"]["block_square_sum"][:3] = 100 * 0.02**2
     quiet = copy_of(state)
     learn_from_block(quiet, SETTINGS)
-    assert quiet["resting_level"] == quiet["moving_level"] == 0.0
+    assert quiet["rest"]["resting_activity"] == quiet["rest"]["moving_activity"] == 0.0
     for name, other in (("resting", "moving"), ("moving", "resting")):
         seen = copy_of(state)
-        seen[f"{name}_stamp"] = seen["block_end"]
+        seen["rest"][f"{name}_stamp"] = seen["rest"]["block_end"]
         learn_from_block(seen, SETTINGS)
-        assert seen[f"{name}_level"] == pytest.approx(3.0 * 0.02**2 / SETTINGS["still_accel_std"] ** 2)
-        assert seen[f"{other}_level"] == 0.0
+        assert seen["rest"][f"{name}_activity"] == pytest.approx(3.0 * 0.02**2 / SETTINGS["still_accel_std"] ** 2)
+        assert seen["rest"][f"{other}_activity"] == 0.0
 
 
 def test_what_comes_before_motion_does_not_spoil_what_rest_is() -> None:
