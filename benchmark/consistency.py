@@ -21,6 +21,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+
 from monte_carlo import BLOCKS, Array, Ensemble, ensemble, mean_band, share_in_band
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -22,10 +22,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "test"))
 
-from recordings.kitti import kitti_recording  # noqa: E402
-
 from eskf_ros.replay.main import main as replay  # noqa: E402
 from eskf_ros.simulate.main import main as simulate  # noqa: E402
+from support.recordings.kitti import kitti_recording  # noqa: E402
 
 INSTALLATION = """\
 /**:

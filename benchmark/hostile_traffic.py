@@ -17,11 +17,10 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "test"))
 
-from hostile_traffic import Listener, Phase, drive, mixed, not_finite, play, position_errors, resident_megabytes  # noqa: E402
-from robot import CONFIG, start_node  # noqa: E402
-from ros_process import Ros  # noqa: E402
-
 from eskf_ros.simulate.scenario import simulate  # noqa: E402
+from support.hostile_traffic import Listener, Phase, drive, mixed, not_finite, play, position_errors, resident_megabytes  # noqa: E402
+from support.robot import CONFIG, start_node  # noqa: E402
+from support.ros_process import Ros  # noqa: E402
 
 ROUND = (Phase(8.0, good=False, hostile=300.0), Phase(20.0, good=True, hostile=300.0), Phase(32.0, True, 0.0))
 SETTLED = 5

@@ -27,7 +27,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "test"))
 
-from ros_process import Process, free_domain  # noqa: E402
+from support.ros_process import Process, free_domain  # noqa: E402
 
 CONFIG = ROOT / "config" / "tunnel_drive.yaml"
 ENDS = ROOT / "benchmark" / "latency_ends.py"

@@ -24,7 +24,6 @@ from eskf_ros.parameters.ros_yaml import load
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from markdown_table import table
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -34,17 +33,18 @@ from eskf_ros.geodesy import earth
 from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.gnss.ranges import ionosphere_free, one_per_satellite
 from eskf_ros.gnss.signals import Gnss
+from markdown_table import table
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "test"))
 
-from conftest import find_data_folder  # noqa: E402
-from recordings import drive_0708, husky, tsukishima, walk  # noqa: E402
-from recordings.common import FIX, IMU, ODOMETRY, Outages, Recording, replayed, results_folder  # noqa: E402
-from recordings.kitti import kitti_recording  # noqa: E402
-from recordings.nagoya import nagoya_ranges_recording, nagoya_recording  # noqa: E402
-from recordings.static_mosaic import Pick, StaticReceiver, medium_earth_orbit  # noqa: E402
-from recordings.thor75 import thor75_recording  # noqa: E402
+from support.data import find_data_folder  # noqa: E402
+from support.recordings import drive_0708, husky, tsukishima, walk  # noqa: E402
+from support.recordings.common import FIX, IMU, ODOMETRY, Outages, Recording, replayed, results_folder  # noqa: E402
+from support.recordings.kitti import kitti_recording  # noqa: E402
+from support.recordings.nagoya import nagoya_ranges_recording, nagoya_recording  # noqa: E402
+from support.recordings.static_mosaic import Pick, StaticReceiver, medium_earth_orbit  # noqa: E402
+from support.recordings.thor75 import thor75_recording  # noqa: E402
 
 Array = NDArray[np.float64]
 

@@ -17,8 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from markdown_table import table
-from monte_carlo import NO_SIDE_SLIP, Array, Run, feed, nees, run, state_error
 
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.error_state import POSITION
@@ -26,6 +24,8 @@ from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.episodes import Episode, Outage
 from eskf_ros.simulate.gnss_episodes import BadFixes, ClaimedStd, Multipath, Spoofing, ZeroCovariance
 from eskf_ros.simulate.scenario import simulate
+from markdown_table import table
+from monte_carlo import NO_SIDE_SLIP, Array, Run, feed, nees, run, state_error
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results.md"

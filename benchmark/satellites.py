@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "test"))
 
-from gnss_sky import KLOBUCHAR, SECONDS, WEEK, all_constellations, measure, receiver_at
-
 from eskf_ros.gnss.ephemeris import Ephemerides
 from eskf_ros.gnss.orbits import satellite_state
 from eskf_ros.gnss.point_solution import solve
@@ -28,6 +26,7 @@ from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, Status, allocate_ran
 from eskf_ros.gnss.rinex_nav import read_navigation
 from eskf_ros.gnss.rinex_obs import read_observations
 from eskf_ros.gnss.signals import SIGNAL_BY_CODE, Gnss
+from support.gnss_sky import KLOBUCHAR, SECONDS, WEEK, all_constellations, measure, receiver_at
 
 SYSTEMS = (Gnss.GPS, Gnss.GALILEO, Gnss.BEIDOU, Gnss.GLONASS)
 CODES = {Gnss.GPS: "1C", Gnss.GALILEO: "1C", Gnss.BEIDOU: "2I", Gnss.GLONASS: "1C"}

@@ -23,7 +23,6 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from monte_carlo import NO_SIDE_SLIP, state_error
 from numpy.typing import NDArray
 
 from eskf_ros.filter.navigator import Navigator
@@ -35,6 +34,7 @@ from eskf_ros.gnss.signals import Gnss
 from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.range_receiver import RangeReceiver
 from eskf_ros.simulate.scenario import simulate
+from monte_carlo import NO_SIDE_SLIP, state_error
 
 Array = NDArray[np.float64]
 

@@ -18,13 +18,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-from estimator_speed import measure as measure_estimator
 from rich.console import Console
 from rich.table import Table
 
 from eskf_ros.bags import BagWriter, open_bag
 from eskf_ros.bags.mcap_file import McapFile
 from eskf_ros.simulate.main import main as simulate
+from estimator_speed import measure as measure_estimator
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 CONFIG = CHECKOUT / "config" / "tunnel_drive.yaml"

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from monte_carlo import run
 from numpy.typing import NDArray
 
 from eskf_ros.filter.navigator import Navigator
@@ -22,6 +21,7 @@ from eskf_ros.simulate.recording import Recording
 from eskf_ros.simulate.scenario import simulate
 from eskf_ros.simulate.scenarios import TUNNEL_START
 from eskf_ros.simulate.wheel import WheelOdometer
+from monte_carlo import run
 
 Array = NDArray[np.float64]
 

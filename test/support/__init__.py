@@ -1,0 +1,1 @@
+"""What several tests need: oracles, kernels, recordings, a robot on ROS."""

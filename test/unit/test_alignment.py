@@ -1,0 +1,563 @@
+"""Start-up: levelling, gyro bias at rest, heading; every sigma against draws from what it claims."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from eskf_ros.filter.alignment import first_fix, levelling
+from eskf_ros.filter.alignment import heading as heading_start
+from eskf_ros.filter.history.records import AID
+from eskf_ros.filter.inertial import navigation_frame
+from eskf_ros.filter.inertial.strapdown import gravity_map
+from eskf_ros.filter.integrity.restart import reset_alignment
+from eskf_ros.filter.layout import blank_state
+from eskf_ros.filter.loop import update_rest
+from eskf_ros.filter.measurements import gnss_position
+from eskf_ros.filter.state.memory import allocate
+from eskf_ros.filter.state.time import NEVER
+from eskf_ros.filter.stationarity import static_window
+from support.kernels import (
+    USUAL_STDS,
+    conditioned_eigenvalues,
+    copy_of,
+    core,
+    make_settings,
+    make_state,
+    random_covariance,
+    to_quaternion,
+    to_rotation,
+)
+
+Array = NDArray[np.float64]
+
+MOUNT = {"imu__mount_position": [0.3, 0.1, -0.2], "imu__mount_rpy_deg": [160.0, -25.0, 130.0]}
+LEVER_ARM = {"gnss__lever_arm": [0.8, -0.2, 1.4]}
+NOISE = {
+    "imu__accel_bias_std": 0.02,
+    "imu__accel_noise_density": 2e-3,
+    "imu__accel_bias_random_walk": 2e-3,
+    "imu__gyro_bias_std": 1e-3,
+    "imu__gyro_noise_density": 5e-5,
+    "imu__gyro_bias_random_walk": 5e-5,
+}
+"""White noise and walk of the bias weigh about the same in the mean of two seconds."""
+
+DATUM = (48.137, 11.575, 565.0)
+RATE_HZ = 100.0
+COUNT = 200
+DRAWS = 400
+
+seeds = pytest.mark.parametrize("seed", range(6))
+
+
+def fresh(datum: tuple[float, float, float] | None = DATUM) -> Any:
+    """Return a filter that has seen nothing but, perhaps, its datum."""
+    state = blank_state()[0]
+    if datum is not None:
+        navigation_frame.set_datum(state, math.radians(datum[0]), math.radians(datum[1]), datum[2])
+    return state
+
+
+def at_rest(state: Any, attitude: Rotation, accel_bias: Any, gyro_bias: Any) -> tuple[Array, Array]:
+    """Return the mean readings of an IMU that lies still with this attitude."""
+    gravity = np.array(gravity_map(state, (0.0, 0.0, 0.0)))
+    turning = (
+        np.array(state["frame"]["earth_rate_map"]) if state["frame"]["datum_known"] else np.array([0.0, 4.8e-5, 5.5e-5])
+    )
+    return attitude.inv().apply(-gravity) + accel_bias, attitude.inv().apply(turning) + gyro_bias
+
+
+def level_with(state: Any, force: Array, rate: Array, settings: Any, still: bool = True) -> None:
+    levelling.level(state, COUNT * np.concatenate([force, rate]), COUNT, 1.0 / RATE_HZ, still, settings)
+
+
+def mean_noise(rng: np.random.Generator, settings: Any, sensor: str) -> Array:
+    """Draw the difference of the mean reading from the bias at its end: white noise, and a bias that walks."""
+    steps = settings[f"{sensor}_bias_random_walk"] / math.sqrt(RATE_HZ) * rng.normal(size=(COUNT, 3))
+    walk = np.cumsum(steps, axis=0)
+    white = settings[f"{sensor}_noise_density"] / math.sqrt(COUNT / RATE_HZ) * rng.normal(size=3)
+    return np.asarray(walk.mean(axis=0) - walk[-1] + white)
+
+
+def tilt_error(state: Any, attitude: Rotation) -> Array:
+    """Return the horizontal part of theta in R_true = exp(theta) R, whatever the heading of either."""
+    up = np.array(navigation_frame.local_up(state))
+    true_up_body = attitude.inv().apply(up)
+    return np.cross(to_rotation(state["attitude"]).apply(true_up_body), up)
+
+
+def assert_chi_square(squares: Any, dof: int) -> None:
+    """A sum of normalised squares lies within what one run in 100 000 exceeds."""
+    total, freedom = float(np.sum(squares)), dof * len(squares)
+    assert chi2.ppf(5e-6, freedom) < total < chi2.ppf(1.0 - 5e-6, freedom), total / freedom
+
+
+# ---------------------------------------------------------------------------------------------------- levelling
+
+
+@seeds
+@pytest.mark.parametrize("still", [True, False])
+def test_tilt_error_is_what_the_accelerometer_bias_makes_of_it(seed: int, still: bool) -> None:
+    rng = np.random.default_rng(seed)
+    attitude = Rotation.random(random_state=seed)
+    bias = rng.normal(0.0, 0.05, 3)
+    state = fresh()
+    level_with(state, *at_rest(state, attitude, bias, np.zeros(3)), make_settings(**MOUNT), still)
+    up = np.array(navigation_frame.local_up(state))
+    expected = np.cross(up, to_rotation(state["attitude"]).apply(bias)) / 9.81
+    # To the second order in bias over gravity.
+    np.testing.assert_allclose(tilt_error(state, attitude), expected, rtol=0.0, atol=3.0 * (0.1 / 9.8) ** 2)
+    assert np.linalg.norm(expected) > 1e-3
+    assert state["level_known"] == 1
+    np.testing.assert_allclose(core(state), core(state).T, rtol=1e-15)
+
+
+@pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0.6, -0.8, 0)])
+@pytest.mark.parametrize("angle", [180.0 - 1e-7, 180.0 - 1e-4, 90.0, 1e-9])
+def test_mounted_upside_down(axis: tuple[float, float, float], angle: float) -> None:
+    attitude = Rotation.from_rotvec(math.radians(angle) * np.array(axis))
+    state = fresh(None)
+    level_with(state, *at_rest(state, attitude, np.zeros(3), np.zeros(3)), make_settings())
+    assert np.linalg.norm(tilt_error(state, attitude)) < 2e-9
+    true_up_body = attitude.inv().apply([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(to_rotation(state["attitude"]).apply(true_up_body), (0, 0, 1), rtol=0.0, atol=2e-9)
+
+
+@pytest.mark.parametrize("a", [(0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (0.6, 0.8, 0.0), (0.0, -0.6, 0.8)])
+def test_turn_into_the_exact_opposite(a: tuple[float, float, float]) -> None:
+    opposite = tuple(-c for c in a)
+    turn = navigation_frame.shortest_turn(a, opposite)
+    assert np.linalg.norm(turn) == pytest.approx(math.pi, abs=1e-12)
+    np.testing.assert_allclose(Rotation.from_rotvec(turn).apply(a), opposite, rtol=0.0, atol=1e-12)
+
+
+def test_level_draws_match_their_covariance() -> None:
+    """Tilt and accelerometer bias jointly: with a wrong sign or no cross covariance the figure explodes."""
+    settings = make_settings(**NOISE)
+    rng = np.random.default_rng(1)
+    joint, tilt_only = [], []
+    for draw in range(DRAWS):
+        attitude = Rotation.random(random_state=draw)
+        bias = rng.normal(0.0, settings["accel_bias_std"], 3)
+        state = fresh()
+        force, rate = at_rest(state, attitude, bias, np.zeros(3))
+        level_with(state, force + mean_noise(rng, settings, "accel"), rate, settings)
+        chosen = [6, 7, 9, 10, 11]
+        covariance = core(state)[np.ix_(chosen, chosen)]
+        assert np.linalg.eigvalsh(covariance).min() > 0.0
+        tilt = tilt_error(state, attitude)[:2]
+        error = np.concatenate([tilt, bias - state["accel_bias"]])
+        joint.append(error @ np.linalg.solve(covariance, error))
+        tilt_only.append(tilt @ np.linalg.solve(covariance[:2, :2], tilt))
+        # Nothing is known of the heading.
+        assert core(state)[8, 8] == pytest.approx(math.pi**2, rel=1e-9)
+    assert_chi_square(joint, 5)
+    assert_chi_square(tilt_only, 2)
+
+
+# ---------------------------------------------------------------------------------------------------- gyro bias
+
+
+def bayes(mean_rate: Array, known: Array, prior_variance: float, noise: Array) -> tuple[Array, Array]:
+    """Return mean and covariance of a bias of zero mean, given one reading of bias plus ``known`` plus noise."""
+    information = np.linalg.inv(noise)
+    covariance = np.linalg.inv(np.eye(3) / prior_variance + information)
+    return covariance @ information @ (mean_rate - known), covariance
+
+
+@pytest.mark.parametrize("case", ["no datum", "heading unknown", "heading known", "moving"])
+@seeds
+def test_gyro_bias_is_the_bayesian_posterior(seed: int, case: str) -> None:
+    heading = {"alignment__initial_heading_deg": 25.0} if case == "heading known" else {}
+    settings = make_settings(**{**NOISE, **heading, "imu__gyro_bias_std": 1e-4})
+    attitude = Rotation.random(random_state=seed)
+    state = fresh(None if case == "no datum" else DATUM)
+    force, rate = at_rest(state, attitude, np.zeros(3), np.random.default_rng(seed).normal(0.0, 1e-4, 3))
+    level_with(state, force, rate, settings, still=case != "moving")
+    if case == "heading known":
+        # The first levelling takes the heading; the second knows where the Earth's rate points.
+        level_with(state, force, rate, settings)
+
+    earth_rate = 7.292115e-5
+    duration = COUNT / RATE_HZ
+    noise = settings["gyro_noise_density"] ** 2 / duration + settings["gyro_bias_random_walk"] ** 2 * duration / 3.0
+    to_body = to_rotation(state["attitude"]).inv().as_matrix()
+    up = np.array(navigation_frame.local_up(state))
+    earth = np.array(state["frame"]["earth_rate_map"])
+    across = np.eye(3) - np.outer(up, up)
+    # A rate of known size and unknown direction has half of its square on each of two axes.
+    square = (across @ earth) @ (across @ earth)
+    known, unknown = (up @ earth) * up, 0.5 * square * across
+    if case == "no datum":
+        known, unknown = np.zeros(3), earth_rate**2 * np.eye(3)
+    elif case == "heading known":
+        known, unknown = earth, square * across * settings["initial_heading_std"] ** 2
+    elif case == "moving":
+        unknown = 1e12 * np.eye(3)
+    mean, covariance = bayes(rate, to_body @ known, 1e-8, noise * np.eye(3) + to_body @ unknown @ to_body.T)
+    np.testing.assert_allclose(state["gyro_bias"], mean, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(core(state)[12:, 12:], covariance, rtol=0.0, atol=1e-13)
+
+
+@pytest.mark.parametrize("gyro_bias_std", [1e-3, 5e-5])
+def test_gyro_bias_draws_are_within_their_covariance(gyro_bias_std: float) -> None:
+    """Across the vertical the Earth rate is of unknown direction but known size, so only the mean is chi-square's."""
+    settings = make_settings(**{**NOISE, "imu__gyro_bias_std": gyro_bias_std})
+    rng = np.random.default_rng(2)
+    vertical, horizontal = [], []
+    for draw in range(DRAWS):
+        attitude = Rotation.random(random_state=draw)
+        bias = rng.normal(0.0, gyro_bias_std, 3)
+        state = fresh()
+        force, rate = at_rest(state, attitude, np.zeros(3), bias)
+        level_with(state, force, rate + mean_noise(rng, settings, "gyro"), settings)
+        to_map = to_rotation(state["attitude"]).as_matrix()
+        error = to_map @ (bias - state["gyro_bias"])
+        covariance = to_map @ core(state)[12:, 12:] @ to_map.T
+        vertical.append(error[2] ** 2 / covariance[2, 2])
+        horizontal.append(error[:2] @ np.linalg.solve(covariance[:2, :2], error[:2]))
+    assert_chi_square(vertical, 1)
+    assert 0.9 * 2.0 < np.mean(horizontal) < 1.1 * 2.0, np.mean(horizontal)
+
+
+# ------------------------------------------------------------------------------------------------------ heading
+
+
+@seeds
+@pytest.mark.parametrize("heading_deg", [-170.0, 0.0, 95.0])
+def test_heading_is_that_of_base_link_with_any_mount(seed: int, heading_deg: float) -> None:
+    settings = make_settings(**MOUNT, **LEVER_ARM)
+    base = Rotation.from_euler("xyz", [4.0, -7.0, 40.0 * seed], degrees=True)
+    mount = Rotation.from_euler("xyz", MOUNT["imu__mount_rpy_deg"], degrees=True)
+    state = make_state((0.0, 0.0, 3.0), attitude=base * mount)
+    assert heading_start.heading_of(state, settings) == pytest.approx(
+        math.remainder(math.radians(40.0 * seed), 2.0 * math.pi), abs=1e-12
+    )
+    before = copy_of(state)
+    heading_start.reset_heading(state, math.radians(heading_deg), 0.1, settings)
+    expected = Rotation.from_euler("xyz", [4.0, -7.0, heading_deg], degrees=True)
+    turned = to_rotation(state["attitude"]) * mount.inv()
+    # The plumb line at the datum's altitude leans against map's z by a microradian.
+    assert (turned.inv() * expected).magnitude() < 5e-6
+    # The antenna, which is what GNSS had held, stays in its place.
+    np.testing.assert_allclose(
+        gnss_position.predict(state, 0, settings), gnss_position.predict(before, 0, settings), rtol=0.0, atol=1e-12
+    )
+
+
+@seeds
+def test_set_heading_turns_the_tilt_error_with_the_attitude(seed: int) -> None:
+    settings = make_settings(**MOUNT)
+    state = make_state(attitude=Rotation.random(random_state=seed))
+    core(state)[:] = random_covariance(seed, USUAL_STDS)
+    before = copy_of(state)
+    theta = np.array([1e-3, -2e-3, 0.0])
+    truth = Rotation.from_rotvec(theta) * to_rotation(state["attitude"])
+    np.testing.assert_allclose(tilt_error(state, truth), theta, rtol=0.0, atol=5e-6)
+    std = 0.05
+    heading_start.reset_heading(state, 2.0, std, settings)
+    turn = to_rotation(state["attitude"]) * to_rotation(before["attitude"]).inv()
+    # What is true has not moved: its tilt, seen from the new attitude, has.
+    np.testing.assert_allclose(tilt_error(state, truth), turn.apply(theta), rtol=0.0, atol=5e-6)
+    up = np.array(navigation_frame.local_up(before))
+    full = np.eye(15)
+    full[6:9, 6:9] = (np.eye(3) - np.outer(up, up)) @ turn.as_matrix()
+    expected = full @ core(before) @ full.T
+    expected[6:9, 6:9] += std**2 * np.outer(up, up)
+    np.testing.assert_allclose(core(state), expected, rtol=0.0, atol=1e-14)
+    assert conditioned_eigenvalues(core(state)).min() > 0.0
+
+
+def test_level_and_heading_draws_match_their_covariance() -> None:
+    """Level, then heading from the parameter: tilt, heading and accelerometer bias jointly, IMU mounted anyhow."""
+    settings = make_settings(
+        **NOISE, **MOUNT, alignment__initial_heading_deg=70.0, alignment__initial_heading_std_deg=2.0
+    )
+    mount = Rotation.from_euler("xyz", MOUNT["imu__mount_rpy_deg"], degrees=True)
+    rng = np.random.default_rng(6)
+    squares = []
+    for _ in range(DRAWS):
+        heading = 70.0 + 2.0 * rng.normal()
+        attitude = Rotation.from_euler("xyz", [rng.normal(), rng.normal(), heading], degrees=True) * mount
+        bias = rng.normal(0.0, settings["accel_bias_std"], 3)
+        state = fresh()
+        force, rate = at_rest(state, attitude, bias, np.zeros(3))
+        level_with(state, force + mean_noise(rng, settings, "accel"), rate, settings)
+        assert state["heading_known"] == 1
+        theta = (attitude * to_rotation(state["attitude"]).inv()).as_rotvec()
+        error = np.concatenate([theta, bias])
+        covariance = core(state)[6:12, 6:12]
+        squares.append(error @ np.linalg.solve(covariance, error))
+    assert_chi_square(squares, 6)
+
+
+def driving(velocity: Any, velocity_covariance: Any, heading: float | None = None, search_std: float = 0.1) -> Any:
+    """Return a level filter of unknown heading that GNSS has given this velocity.
+
+    The accelerations have told the search a heading (default: the course) with ``search_std`` (rad).
+    """
+    state = make_state((100.0, 50.0, 0.0), velocity, Rotation.from_euler("z", 1.0))
+    state["heading_known"] = 0
+    core(state)[:] = np.diag(np.repeat([1.0, 0.1, 0.002, 0.02, 1e-3], 3) ** 2)
+    core(state)[8, 8] = math.pi**2
+    core(state)[3:5, 3:5] = velocity_covariance
+    turn = (math.atan2(velocity[1], velocity[0]) if heading is None else heading) - 1.0
+    state["search"]["started"] = 1
+    state["search"]["estimate"][4:6] = math.cos(turn), math.sin(turn)
+    state["search"]["covariance"][4:6, 4:6] = search_std**2 * np.eye(2)
+    return state
+
+
+def test_course_alignment_is_as_good_as_it_says() -> None:
+    """Heading error over its sigma, for velocities in error as their covariance says and a crab angle as declared."""
+    settings = make_settings(alignment__course_std_deg=1.0, **LEVER_ARM)
+    rng = np.random.default_rng(3)
+    normalized = []
+    for draw in range(DRAWS):
+        heading, speed = rng.uniform(-math.pi, math.pi), rng.uniform(4.0, 15.0)
+        covariance = random_covariance(draw, [0.25, 0.1])
+        course = heading + math.radians(1.0) * rng.normal()
+        velocity = speed * np.array([math.cos(course), math.sin(course)])
+        velocity = velocity + rng.multivariate_normal([0.0, 0.0], covariance)
+        state = driving((*velocity, 0.0), covariance, heading)
+        heading_start.align_to_course(state, settings)
+        assert state["heading_known"] == 1
+        off = math.remainder(heading - heading_start.heading_of(state, settings), 2.0 * math.pi)
+        normalized.append(off**2 / core(state)[8, 8])
+    assert_chi_square(normalized, 1)
+
+
+@pytest.mark.parametrize(
+    ("velocity", "std", "turn_rate", "aligned"),
+    [
+        ((8.0, 3.0, 0.0), 0.1, 0.0, True),
+        ((8.0, 3.0, 0.0), 0.1, 0.19, True),
+        ((8.0, 3.0, 0.0), 0.1, 0.25, False),
+        ((8.0, 3.0, 0.0), 0.1, -0.25, False),
+        ((8.0, 3.0, 0.0), 2.0, 0.0, False),
+        ((1.9, 0.0, 0.0), 0.1, 0.0, False),
+        ((2.1, 0.0, 0.0), 0.1, 0.0, True),
+        ((0.0, 0.0, 0.0), 0.1, 0.0, False),
+    ],
+)
+def test_course_is_taken_only_when_it_means_something(
+    velocity: Any, std: float, turn_rate: float, aligned: bool
+) -> None:
+    settings = make_settings(alignment__course_min_speed=2.0)
+    state = driving(velocity, std**2 * np.eye(2))
+    state["angular_rate"] = (0.0, 0.0, turn_rate)
+    before = copy_of(state)
+    heading_start.align_to_course(state, settings)
+    assert bool(state["heading_known"]) == aligned
+    if not aligned:
+        np.testing.assert_array_equal(state["attitude"], before["attitude"])
+        np.testing.assert_array_equal(core(state), core(before))
+
+
+@pytest.mark.parametrize(
+    ("heading_deg", "search_std", "found_deg"),
+    [
+        (0.0, 0.1, 0.0),
+        (8.0, 0.1, 0.0),  # the course is sharper than the search
+        (180.0, 0.1, 180.0),  # in reverse
+        (172.0, 0.1, 180.0),
+        (40.0, 0.1, None),  # side slip
+        (90.0, 0.1, None),
+        (0.0, 0.4, None),  # not decided yet
+    ],
+)
+def test_the_course_sharpens_what_the_accelerations_have_decided(
+    heading_deg: float, search_std: float, found_deg: float | None
+) -> None:
+    settings = make_settings()
+    state = driving((8.0, 0.0, 0.0), 0.01 * np.eye(2), math.radians(heading_deg), search_std)
+    heading_start.align_to_course(state, settings)
+    assert bool(state["heading_known"]) == (found_deg is not None)
+    if found_deg is not None:
+        off = heading_start.heading_of(state, settings) - math.radians(found_deg)
+        assert math.remainder(off, math.tau) == pytest.approx(0.0, abs=1e-9)
+
+
+# ---------------------------------------------------------------------------------------------------- stillness
+
+
+def watch(state: Any, settings: Any, seconds: float, force: Any, rate: Any, shaking: float = 0.0) -> None:
+    """Show the stillness watch ``seconds`` of samples at 100 Hz, with a sine of ``shaking`` on the force."""
+    for k in range(round(seconds * RATE_HZ)):
+        state["stamp"] += 10_000_000
+        state["specific_force"] = np.array(force) + (shaking * math.sin(0.9 * k), 0.0, 0.0)
+        state["angular_rate"] = rate
+        update_rest(state, settings)
+
+
+def waiting() -> Any:
+    state = fresh()
+    state["stamp"] = state["imu"]["stamp"] = 1_000_000_000
+    state["imu"]["interval"] = 0.01
+    return state
+
+
+def test_level_after_the_first_still_window() -> None:
+    settings = make_settings(alignment__static_duration=2.0)
+    state = waiting()
+    force, rate = at_rest(state, Rotation.from_euler("xyz", [0.2, -0.1, 0.0]), np.zeros(3), [0.01, 0.02, -0.01])
+    watch(state, settings, 1.9, force, rate)
+    assert state["level_known"] == 0
+    watch(state, settings, 0.2, force, rate)
+    assert state["level_known"] == 1
+    sigma = np.sqrt(np.diag(core(state))[12:])
+    watch(state, settings, 30.0, force, rate)
+    # More still windows make the mean of the gyro better, until the Earth's rate is what is not known.
+    assert (np.sqrt(np.diag(core(state))[12:]) < 0.9 * sigma).all()
+    np.testing.assert_allclose(state["gyro_bias"], (0.01, 0.02, -0.01), rtol=0.0, atol=6e-5)
+
+
+def test_shaking_is_no_rest_and_a_long_drive_levels_all_the_same() -> None:
+    settings = make_settings(alignment__static_duration=2.0, alignment__moving_start_after=10.0)
+    state = waiting()
+    force, rate = at_rest(state, Rotation.identity(), np.zeros(3), [0.01, 0.02, -0.01])
+    watch(state, settings, 9.0, force, rate, shaking=3.0)
+    assert state["level_known"] == 0
+    watch(state, settings, 4.0, force, rate, shaking=3.0)
+    assert state["level_known"] == 1
+    assert core(state)[6, 6] >= settings["moving_tilt_std"] ** 2
+    # Not at rest: the gyros say nothing of their bias.
+    np.testing.assert_array_equal(state["gyro_bias"], 0.0)
+    np.testing.assert_allclose(np.diag(core(state))[12:], settings["gyro_bias_std"] ** 2, rtol=1e-12)
+
+
+@pytest.mark.parametrize("turn", [math.radians(0.5), math.radians(2.0)])
+def test_a_creeping_turn_after_a_rest_is_no_rest(turn: float) -> None:
+    """It is quiet, level, and no fix proves the motion: only that no bias changes by as much tells."""
+    settings = make_settings(alignment__static_duration=2.0)
+    state = waiting()
+    bias = np.array([0.01, 0.02, -0.01])
+    force, rate = at_rest(state, Rotation.identity(), np.zeros(3), bias)
+    watch(state, settings, 10.5, force, rate)
+    known = state["gyro_bias"].copy()
+    watch(state, settings, 10.0, force, rate + np.array([0.0, 0.0, turn]))
+    np.testing.assert_array_equal(state["gyro_bias"], known)
+
+
+def test_a_bias_that_warms_up_is_followed_at_rest() -> None:
+    settings = make_settings(alignment__static_duration=2.0)
+    state = waiting()
+    bias = np.array([0.01, 0.02, -0.01])
+    force, rate = at_rest(state, Rotation.identity(), np.zeros(3), bias)
+    for second in range(60):
+        watch(state, settings, 1.0, force, rate + np.radians(0.1) * second / 60.0)
+    assert state["stamp"] - state["window"]["still_stamp"] < 3_000_000_000
+
+
+def test_restart_while_standing_still_counts_from_zero() -> None:
+    """The IMU falls silent on a parked robot: afterwards the gyro bias is what it was before, not several times it."""
+    settings = make_settings(alignment__static_duration=2.0)
+    state = waiting()
+    bias = np.array([0.01, 0.02, -0.01])
+    force, rate = at_rest(state, Rotation.identity(), np.zeros(3), bias)
+    watch(state, settings, 20.5, force, rate)
+    np.testing.assert_allclose(state["gyro_bias"], bias, rtol=0.0, atol=1e-4)
+    reset_alignment(state)
+    state["stamp"] += 6_000_000_000
+    watch(state, settings, 2.5, force, rate)
+    assert state["level_known"] == 1
+    # Two seconds leave 1 % of the prior; the sums of the 20 s before would make it ten times the bias.
+    np.testing.assert_allclose(state["gyro_bias"], bias, rtol=0.0, atol=4e-4)
+
+
+def test_restart_under_way_does_not_know_the_heading_of_the_start() -> None:
+    """The parameter says where the robot pointed when it was switched on, not after a drive and a hole in the data."""
+    settings = make_settings(alignment__static_duration=2.0, alignment__initial_heading_deg=30.0)
+    state = waiting()
+    force, rate = at_rest(state, Rotation.identity(), np.zeros(3), np.zeros(3))
+    watch(state, settings, 2.5, force, rate)
+    assert state["heading_known"] == 1
+    state["attitude"] = to_quaternion(Rotation.from_euler("z", 170.0, degrees=True))
+    reset_alignment(state)
+    state["stamp"] += 6_000_000_000
+    watch(state, settings, 2.5, force, rate)
+    assert state["heading_known"] == 0 or core(state)[8, 8] > 0.5
+
+
+def distrusting(robots: int, std: float, speed: float = 0.0) -> int:
+    """Return how many robots, level and waiting for a heading, lose their level to 20 s of fixes at 5 Hz.
+
+    Fixes scatter by ``std`` (m) on each axis and move at ``speed`` (m/s); a still window has just passed every 2 s.
+    """
+    rng = np.random.default_rng(7)
+    settings = make_settings()
+    aid = allocate(AID)[0]
+    found = 0
+    for _ in range(robots):
+        state = make_state()
+        state["heading_known"] = 0
+        for epoch in range(100):
+            seconds = 0.2 * epoch
+            east, north, up = std * rng.normal(size=3)
+            latitude = math.radians(DATUM[0]) + (north + speed * seconds) / 6.378e6
+            longitude = math.radians(DATUM[1]) + east / (6.378e6 * math.cos(latitude))
+            aid["stamp"] = round(seconds * 1e9)
+            aid["payload"][:9] = (latitude, longitude, DATUM[2] + up, std**2, 0.0, 0.0, std**2, 0.0, std**2)
+            if static_window.update_evidence_from_fix(state, aid):
+                levelling.reset_level_to_moving(state, settings)
+            if state["window"]["motion_stamp"] > 0 and state["window"]["still_stamp"] == NEVER:
+                found += 1
+                break
+            if epoch % 10 == 0:
+                state["window"]["still_stamp"] = aid["stamp"]
+                state["window"]["anchor_stamp"][:] = state["window"]["last_fix_stamp"]
+                state["window"]["anchor_ecef"][:] = state["window"]["last_fix_ecef"]
+    return found
+
+
+@pytest.mark.parametrize("std", [1.0, 20.0])
+def test_the_scatter_of_fixes_takes_no_level_away(std: float) -> None:
+    """At most one parked robot in a hundred; with three sigma, which a norm of three exceeds often, it is 17 or 67."""
+    assert distrusting(200, std) <= 2
+
+
+@pytest.mark.parametrize(("std", "speed"), [(0.02, 6.5), (1.0, 15.0)])
+def test_fixes_that_move_take_a_false_level_away(std: float, speed: float) -> None:
+    """No robot can have stood still within the last 2 s: what felt like rest was an even drive."""
+    assert distrusting(20, std, speed) == 20
+
+
+def test_first_fix_starts_the_position() -> None:
+    """The datum is the fix; up, so far map's z without a datum, turns to the local vertical; level stays level."""
+    settings = make_settings()
+    state = fresh(None)
+    attitude = Rotation.from_euler("xyz", [0.3, -0.2, 0.0])
+    level_with(state, *at_rest(state, attitude, np.zeros(3), np.zeros(3)), settings)
+    payload = np.array([math.radians(48.0), math.radians(11.0), 500.0, 1.0, 0.0, 0.0, 1.0, 0.0, 4.0])
+    first_fix.reset_position_to_fix(state, payload)
+    assert (state["frame"]["datum_known"], state["position_known"]) == (1, 1)
+    np.testing.assert_array_equal(state["frame"]["datum"], payload[:3])
+    np.testing.assert_allclose(state["position_map"], 0.0, atol=1e-9)
+    # The plumb line at 500 m altitude leans by less than a microradian against the normal of the ellipsoid.
+    assert np.linalg.norm(tilt_error(state, attitude)) < 1e-6
+    assert (core(state) == core(state).T).all()
+    assert conditioned_eigenvalues(core(state)).min() > 0.0
+    np.testing.assert_array_equal(np.diag(core(state))[:3], first_fix.START_POSITION_STD**2)
+
+
+def test_far_datum_levels_along_the_local_vertical() -> None:
+    """A configured datum 500 km away: its z is 4.5 degrees off the plumb line where the robot stands."""
+    settings = make_settings()
+    state = fresh((48.0, 11.0, 0.0))
+    attitude = Rotation.from_euler("xyz", [0.1, 0.0, 1.0])
+    # Level first, along map's z as far as is known; the fix then tells where the robot is.
+    force = attitude.inv().apply([0.0, 0.0, 9.81])
+    level_with(state, force, np.zeros(3), settings)
+    payload = np.array([math.radians(52.5), math.radians(11.0), 80.0, 1.0, 0.0, 0.0, 1.0, 0.0, 4.0])
+    first_fix.reset_position_to_fix(state, payload)
+    up = np.array(navigation_frame.local_up(state))
+    assert math.degrees(math.acos(up[2])) == pytest.approx(4.5, abs=0.02)
+    measured_up = to_rotation(state["attitude"]).apply(force / 9.81)
+    np.testing.assert_allclose(measured_up, up, rtol=0.0, atol=1e-6)

@@ -1,0 +1,219 @@
+"""The one measurement update against a dense Kalman update; gates; what a rejected measurement leaves behind."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from eskf_ros.filter.measurements.kalman_update import invert_positive, update, update_nominal_state
+from eskf_ros.filter.state.enums import Stream, Verdict
+from support.kernels import (
+    USUAL_STDS,
+    conditioned_eigenvalues,
+    copy_of,
+    core,
+    error_of,
+    make_settings,
+    make_work,
+    random_covariance,
+    random_state,
+    to_rotation,
+    with_error,
+)
+
+Array = NDArray[np.float64]
+
+OPEN_GATE = 1e300
+
+
+def measurement(seed: int, size: int, noise_std: float = 0.5) -> Any:
+    """Return WORK with a random Jacobian (whole and sparse rows), innovation and correlated noise."""
+    rng = np.random.default_rng(seed)
+    work = make_work()
+    jacobian = rng.normal(size=(3, 15)) * (rng.random((3, 15)) < rng.choice([0.2, 1.0]))
+    jacobian[:, 0:3] += np.eye(3)
+    work["jacobian"][:, :15] = jacobian
+    work["innovation"] = rng.normal(0.0, noise_std, 3)
+    work["noise"] = random_covariance(seed + 1, [noise_std] * 3)
+    if size < 3:
+        # What lies beyond the size must not count.
+        work["noise"][size:], work["noise"][:, size:] = np.nan, np.nan
+        work["jacobian"][size:], work["innovation"][size:] = np.nan, np.nan
+    return work
+
+
+def dense_update(covariance: Array, work: Any, size: int) -> tuple[Array, Array, float]:
+    """Return correction, Joseph covariance before the reset, normalised innovation squared; all by matrices."""
+    h, z = work["jacobian"][:size, :15].copy(), work["innovation"][:size].copy()
+    r = work["noise"][:size, :size].copy()
+    s = h @ covariance @ h.T + r
+    gain = np.linalg.solve(s, h @ covariance).T
+    keep = np.eye(15) - gain @ h
+    return gain @ z, keep @ covariance @ keep.T + gain @ r @ gain.T, float(z @ np.linalg.solve(s, z))
+
+
+def reset_by_differences(theta: Array) -> Array:
+    """Differentiate the new attitude error by the old one where the estimate ``theta`` has been injected."""
+    h = 1e-5
+    reset = np.eye(15)
+    for axis in range(3):
+        step = h * np.eye(3)[axis]
+        plus, minus = (
+            (Rotation.from_rotvec(theta + k * step) * Rotation.from_rotvec(theta).inv()).as_rotvec() for k in (1, -1)
+        )
+        reset[6:9, 6 + axis] = (plus - minus) / (2.0 * h)
+    return reset
+
+
+@settings(max_examples=150)
+@given(
+    seed=st.integers(0, 2**31),
+    size=st.integers(1, 3),
+    spread=st.floats(-2.0, 2.0),
+    noise_std=st.floats(-2.0, 1.0).map(lambda exponent: 10.0**exponent),
+)
+def test_update_is_the_dense_kalman_update(seed: int, size: int, spread: float, noise_std: float) -> None:
+    state = random_state(seed % 1000)
+    covariance = random_covariance(seed, USUAL_STDS * 10.0**spread)
+    core(state)[:] = covariance
+    before = copy_of(state)
+    work = measurement(seed, size, noise_std)
+    correction, joseph, nis = dense_update(covariance, work, size)
+    verdict, our_nis = update(state, size, OPEN_GATE, work)
+    assert verdict == Verdict.FUSED
+    assert our_nis == pytest.approx(nis, rel=1e-7)
+    # The state moved by the correction, the attitude by a rotation on the map side.
+    moved = error_of(before, state)
+    turn = Rotation.from_rotvec(correction[6:9]).as_rotvec()
+    expected = np.concatenate([correction[:6], turn, correction[9:]])
+    np.testing.assert_allclose(moved / USUAL_STDS, expected / USUAL_STDS, rtol=1e-6, atol=1e-7)
+    reset = reset_by_differences(correction[6:9])
+    after = reset @ joseph @ reset.T
+    scale = np.sqrt(np.outer(np.diag(after), np.diag(after)))
+    np.testing.assert_allclose(core(state) / scale, after / scale, rtol=0.0, atol=1e-6)
+
+
+def test_reset_of_a_large_correction() -> None:
+    """A turn of 0.8 rad at once: the covariance afterwards is about the new attitude."""
+    state = random_state(5)
+    covariance = random_covariance(6, np.repeat([2.0, 0.3, 0.6, 0.1, 0.003], 3))
+    core(state)[:] = covariance
+    work = measurement(7, 3)
+    work["jacobian"] = 0.0
+    work["jacobian"][:, 6:9] = np.eye(3)
+    work["noise"] = 0.01 * np.eye(3)
+    work["innovation"] = [0.5, -0.6, 0.3]
+    correction, joseph, _ = dense_update(covariance, work, 3)
+    assert np.linalg.norm(correction[6:9]) > 0.7
+    assert update(state, 3, OPEN_GATE, work)[0] == Verdict.FUSED
+    reset = reset_by_differences(correction[6:9])
+    np.testing.assert_allclose(core(state), reset @ joseph @ reset.T, rtol=1e-7, atol=1e-9)
+    assert np.abs(core(state) - joseph).max() > 1e-3
+
+
+@given(st.integers(0, 2**31))
+def test_injection_is_the_error_definition(seed: int) -> None:
+    state = random_state(seed % 1000)
+    correction = np.random.default_rng(seed).normal(size=15) * np.repeat([5.0, 1.0, 0.5, 0.1, 0.01], 3)
+    expected = with_error(state, correction)
+    update_nominal_state(state, correction)
+    for name in ("position_map", "velocity_map", "accel_bias", "gyro_bias"):
+        np.testing.assert_allclose(state[name], expected[name], rtol=0.0, atol=1e-12)
+    assert (to_rotation(state["attitude"]) * to_rotation(expected["attitude"]).inv()).magnitude() < 1e-14
+    assert np.linalg.norm(state["attitude"]) == pytest.approx(1.0, abs=4e-16)
+
+
+def test_certain_measurements_of_an_uncertain_state() -> None:
+    """Position 1000 m uncertain, fixes of a millimetre, again and again with everything correlated."""
+    state = random_state(3)
+    core(state)[:] = random_covariance(2, np.repeat([1000.0, 100.0, 3.0, 0.2, 0.01], 3))
+    rng = np.random.default_rng(1)
+    for turn in range(300):
+        work = measurement(turn, 3)
+        work["jacobian"][:, :15] = rng.normal(0.0, 0.3, (3, 15)) * (rng.random((3, 15)) < 0.3)
+        column = 3 * (turn % 2)
+        work["jacobian"][:, column : column + 3] += np.eye(3)
+        work["innovation"] = 0.0
+        work["noise"] = 1e-6 * np.eye(3)
+        assert update(state, 3, OPEN_GATE, work)[0] == Verdict.FUSED
+        covariance = core(state)
+        assert (covariance == covariance.T).all()
+        assert conditioned_eigenvalues(covariance).min() > 0.0, (turn, conditioned_eigenvalues(covariance))
+
+
+def test_the_same_certain_fix_a_thousand_times() -> None:
+    state = random_state(3)
+    core(state)[:] = np.diag(np.repeat([1000.0, 100.0, 3.0, 0.2, 0.01], 3) ** 2)
+    work = measurement(1, 3)
+    for count in range(1, 1001):
+        work["jacobian"][:, :15] = np.eye(3, 15)
+        work["innovation"] = 0.0
+        work["noise"] = 1e-8 * np.eye(3)
+        assert update(state, 3, OPEN_GATE, work)[0] == Verdict.FUSED
+        np.testing.assert_allclose(np.diag(core(state))[:3], 1e-8 / count, rtol=1e-3)
+    assert conditioned_eigenvalues(core(state)).min() > 0.0
+
+
+@pytest.mark.parametrize("probability", [0.95, 0.999, 0.9999])
+def test_gates_are_chi_square_quantiles(probability: float) -> None:
+    gates = make_settings(gnss__gate_probability=probability)["gate"][Stream.GNSS_POSITION]
+    for dof in (1, 2, 3):
+        assert chi2.cdf(gates[dof], dof) == pytest.approx(probability, abs=1e-12)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_rejected_leaves_every_bit_as_it_was(size: int) -> None:
+    state = random_state(8)
+    core(state)[:] = random_covariance(9, USUAL_STDS)
+    work = measurement(10, size)
+    _, _, nis = dense_update(core(state), work, size)
+    bits = state.tobytes()
+    for gate, wanted in ((nis * (1.0 - 1e-9), Verdict.GATE), (0.0, Verdict.GATE)):
+        verdict, our_nis = update(state, size, gate, work)
+        assert (verdict, state.tobytes() == bits) == (wanted, True)
+        assert our_nis == pytest.approx(nis, rel=1e-9)
+    assert update(state, size, nis * (1.0 + 1e-9), work)[0] == Verdict.FUSED
+    assert state.tobytes() != bits
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_innovation_that_is_no_number_is_rejected(bad: float) -> None:
+    state = random_state(8)
+    core(state)[:] = random_covariance(9, USUAL_STDS)
+    work = measurement(10, 3)
+    work["innovation"][1] = bad
+    bits = state.tobytes()
+    assert update(state, 3, OPEN_GATE, work)[0] == Verdict.GATE
+    assert state.tobytes() == bits
+
+
+@pytest.mark.parametrize(
+    "noise", [-10.0 * np.eye(3), np.full((3, 3), np.nan), np.diag([1.0, 1.0, -500.0]), np.full((3, 3), np.inf)]
+)
+def test_noise_that_is_no_covariance_is_refused(noise: Array) -> None:
+    state = random_state(8)
+    core(state)[:] = random_covariance(9, USUAL_STDS)
+    work = measurement(10, 3)
+    work["noise"] = noise
+    bits = state.tobytes()
+    verdict, nis = update(state, 3, OPEN_GATE, work)
+    assert verdict == Verdict.BAD_COVARIANCE
+    assert np.isnan(nis)
+    assert state.tobytes() == bits
+
+
+@given(seed=st.integers(0, 2**31), size=st.integers(1, 3), decades=st.integers(0, 5))
+def test_inverse(seed: int, size: int, decades: int) -> None:
+    matrix = random_covariance(seed, 10.0 ** np.linspace(0, -decades, size))
+    inverse = matrix.copy()
+    assert invert_positive(inverse, size)
+    assert (inverse == inverse.T).all()
+    condition = np.linalg.cond(matrix)
+    np.testing.assert_allclose(inverse @ matrix, np.eye(size), rtol=0.0, atol=1e-14 * condition)
