@@ -932,8 +932,8 @@ def test_catching_signals_costs_no_import_of_ros() -> None:
 
 def test_no_two_test_processes_share_a_domain() -> None:
     free_domain()
-    folders = [Path(eskf_ros.__file__).parent.parent, Path(__file__).parent]
+    folders = [Path(eskf_ros.__file__).parent.parent, Path(__file__).parents[1]]
     code = f"import sys; sys.path[:0] = {[str(folder) for folder in folders]}\n"
-    code += "import ros_process; print(ros_process.free_domain())"
+    code += "from support import ros_process; print(ros_process.free_domain())"
     other = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert int(other.stdout) != free_domain()

@@ -260,7 +260,7 @@ def test_transformed_attitude_error(seed: int) -> None:
     before = random_covariance(seed, USUAL_STDS)
     matrix = np.random.default_rng(seed).normal(size=(3, 3))
     after = before.copy()
-    kernel.transform_error(after, 6, tuple(tuples(row) for row in matrix))
+    kernel.update_error_axes(after, 6, tuple(tuples(row) for row in matrix))
     full = np.eye(15)
     full[6:9, 6:9] = matrix
     np.testing.assert_allclose(after, full @ before @ full.T, rtol=1e-12, atol=1e-18)
