@@ -47,6 +47,7 @@ setup(
         "test": [
             "gtsam",
             "hypothesis",
+            "matplotlib",  # examples/compare_configurations.py draws a plot
             "mypy",
             "pygeomag",
             "pymap3d",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import runpy
 from pathlib import Path
 from typing import Any
 
@@ -268,8 +267,3 @@ def test_other_refusals(short: Tables) -> None:
         eskf_ros.Filter({"gnss": {"lever_arn": [0.0, 0.0, 0.0]}})
     with pytest.raises(TypeError, match="parameters are a int"):
         eskf_ros.Filter(3)  # type: ignore[arg-type]
-
-
-def test_the_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    runpy.run_path(str(CHECKOUT / "examples" / "numpy_arrays.py"), run_name="__main__")
-    assert "fixes fused" in capsys.readouterr().out

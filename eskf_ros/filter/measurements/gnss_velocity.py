@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy.typing as npt
+
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import body_rate, local_east_north_up_to_ecef
 from eskf_ros.filter.measurements.jacobians import clear, set_east_north_up_covariance, set_identity, set_minus_cross
-from eskf_ros.filter.measurements.row import HIGHEST_SPEED, NEEDS_POSITION, Row, threefold
+from eskf_ros.filter.measurements.row import HIGHEST_SPEED, NEEDS_POSITION, Readings, Row, linear_covariances, threefold
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ATTITUDE, GYRO_BIAS, VELOCITY
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix
@@ -70,6 +72,11 @@ def linearize(state, payload, source, settings, work):
     return SIZE
 
 
+def read(messages: npt.NDArray[Any]) -> Readings:
+    """Velocity (m/s) of the antenna, East-North-Up."""
+    return messages["linear_velocity"], linear_covariances(messages)
+
+
 def limits(gnss: Any) -> dict[str, Any]:
     """Particulars of the `Intake`."""
     return {
@@ -85,6 +92,7 @@ ROW = Row(
     "GNSS velocity",
     group_name="gnss",
     types=("geometry_msgs/msg/TwistWithCovarianceStamped", "geometry_msgs/msg/TwistStamped"),
+    read=read,
     limits=limits,
     depth=50,
     is_gnss=True,

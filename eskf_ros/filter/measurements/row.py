@@ -142,8 +142,8 @@ class Row:
 
     @property
     def is_sent(self) -> bool:
-        """Whether a message of a sensor brings it as values and covariances (the receiver has intakes of its own)."""
-        return self.read is not None
+        """Whether the messages of a sensor bring it. What a GNSS receiver solved has intakes of its own."""
+        return self.read is not None and self.group is not None
 
 
 def threefold(value: float) -> Axes:
