@@ -19,8 +19,8 @@ same variance for each. Separate columns of variances have ``_x``, ``_y``, ``_z`
 ``covariance``. Without it the ``unknown_..._std`` of the parameters stand in. A negative variance: not measured.
 
 ``stamp`` (n,), in every table, on one clock: int64 nanoseconds, float64 seconds (since 1970 they are good to 0.24 us
-only) or datetime64. Rows need not be sorted. A stamp that cannot be understood is a ValueError, as is any other table
-that cannot be used; a single bad row is left out and counted in the warnings.
+only) or datetime64. Rows need not be sorted. A table that cannot be used, or a stamp whose unit is unclear, raises
+ValueError; a single bad row is left out and counted in the warnings.
 """
 
 from __future__ import annotations
@@ -56,6 +56,7 @@ __all__ = ["Filter", "Result", "run"]
 ParametersLike = str | PathLike[str] | Parameters | Mapping[str, object] | None
 
 LARGEST_CHUNK = 1024
+"""IMU samples given to the navigator at once, at most."""
 
 
 DROPS = {
@@ -70,36 +71,40 @@ DROPS = {
     Verdict.DISABLED: "switched off by the parameters",
     Verdict.WAITING: "newer than the newest IMU sample",
 }
+"""Why a measurement was not used, by verdict."""
+
 IMU_DROPS = {
     "duplicate": "a second one with the same stamp",
     "late": "older than the window history.window",
     "bad_value": "not finite, or larger than a strapdown IMU can read",
     "bad_stamp": "a stamp that is not positive, or far from the others",
 }
+"""Why an IMU sample was not used, by the counter of the navigator."""
 
 
 _KINDS = {row.name: row for row in ROWS if row.columns}
-"""What can be pushed, by name: the rows of the measurements."""
+"""Rows of the measurements that can be pushed, by name."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """What the filter found. Tables are DataFrames where pandas is installed, else structured arrays.
+    """Results of the filter. Tables are DataFrames if pandas is installed, else structured arrays.
 
     In a DataFrame a vector is a column for each element (``position_x``), in an array a field of shape (3,).
 
     Attributes:
-        trajectory: base_link at the samples of the output grid, each from what has a stamp up to then. ``stamp`` ns,
+        trajectory: base_link at the samples of the output grid, each estimated from stamps up to its own. ``stamp`` ns,
             ``status``, ``position_known``, ``heading_known``, ``latitude_deg``, ``longitude_deg``, ``altitude`` m over
             the ellipsoid, ``position`` m and ``velocity`` m/s in map (East-North-Up at the datum), ``attitude`` (w x y
             z, base_link to map), ``position_std`` m, ``rotation_std`` rad. NaN while the position is unknown.
         innovations: one row for each measurement: ``aid``, ``stamp`` ns, ``verdict``, ``dof``, ``nis``, ``innovation``
-            (3 numbers, NaN where there are less), the constraints zupt, zaru and nhc included.
+            (3 numbers, NaN beyond ``dof``), the constraints zupt, zaru and nhc included.
         biases: ``stamp``, ``accel_bias`` m/s2, ``gyro_bias`` rad/s, ``accel_bias_std``, ``gyro_bias_std`` in IMU axes.
-        warnings: what is wrong or worth knowing, one sentence each; what was dropped, with counts and reasons.
+        warnings: faults and facts worth knowing, one sentence each; what was dropped, with counts and reasons.
         summary: ``imu`` counts, ``aids`` by name (``offered``, ``fused``, ``rejected``, ``late``, ``waiting``,
             ``nis_mean``, ``nis_in_95``, ``verdicts``), ``datum``, ``restarts``, ``position_resets``, ``final`` state.
-        odometry: the rows of the trajectory as the filter gives them (``filter.layout.ODOMETRY``), with covariances.
+        odometry: the rows of the trajectory as the filter gives them (``filter.output.global_odometry.ODOMETRY``), with
+            covariances.
     """
 
     trajectory: Any
@@ -113,7 +118,7 @@ class Result:
 class Filter:
     """The filter for tables that come in pieces: push in any order, then `update`.
 
-    What is pushed between two updates gives the same bits in whatever order it is pushed.
+    The result is the same, bit for bit, in whatever order the tables between two updates are pushed.
     """
 
     def __init__(self, parameters: ParametersLike = None, output_rate: float = 0.0) -> None:
@@ -124,8 +129,8 @@ class Filter:
 
         Raises:
             ParameterError: the parameters cannot be used.
-            ValueError: the rate is not a number from 0 on.
-            TypeError: the parameters are something else.
+            ValueError: the rate is negative or not finite.
+            TypeError: the parameters have another type.
         """
         if not (math.isfinite(output_rate) and output_rate >= 0.0):
             raise ValueError(f"output_rate is {output_rate!r}: give Hz from 0 on, 0 for every IMU sample")
@@ -140,7 +145,7 @@ class Filter:
         self._unused: dict[str, list[str]] = {}
 
     def push_imu(self, imu: Any) -> None:
-        """Take IMU samples; columns as in the head of this module. Raises ValueError for a table of another form."""
+        """Take IMU samples; columns as in the module docstring. Raises ValueError for a table that cannot be used."""
         table = Table("imu", imu)
         stamps = table.stamps()
         values = np.column_stack(
@@ -150,7 +155,7 @@ class Filter:
         self._imu_parts.append((stamps, values))
 
     def push(self, name: str, table: Any) -> None:
-        """Take measurements; ``name`` and columns as in the head of this module, errors as in `push_imu`."""
+        """Take measurements; ``name`` and columns as in the module docstring, errors as in `push_imu`."""
         if name not in _KINDS:
             raise ValueError(f"{name}: no such measurement; there are {', '.join(_KINDS)}")
         self._push(name, table)
@@ -186,7 +191,7 @@ class Filter:
     def update(self) -> NDArray[Any]:
         """Process what was pushed, in the order of stamps, up to the newest IMU sample; newer measurements wait.
 
-        Returns the new ODOMETRY rows (`filter.layout`), one for each new IMU sample on the output grid.
+        Returns the new ODOMETRY rows (`filter.output.global_odometry`), one for each new IMU sample on the output grid.
         """
         stamps, imu = in_order(self._imu_parts, 6)
         self._imu_parts = []
@@ -205,7 +210,7 @@ class Filter:
                 np.ascontiguousarray(imu[first:end, :3]),
                 np.ascontiguousarray(imu[first:end, 3:]),
             )
-            # After a jump the IMU has to be believed first: the measurements would be far ahead of it.
+            # After a jump the IMU must confirm it first: the measurements would be refused as far ahead of it.
             if is_jump:
                 rows.append(self._navigator.push_imu(*chunk))
             self._give(aids[given:until], previous is None)
@@ -216,13 +221,13 @@ class Filter:
         rows.append(self._navigator.update())
         if len(stamps):
             self._newest = max(int(stamps[-1]), self._newest or 0)
-        # As bytes: numpy copies structured arrays field by field and takes ten times as long.
+        # Joined as bytes: numpy copies structured arrays field by field, which takes ten times as long.
         new = np.frombuffer(b"".join(part.tobytes() for part in rows), ODOMETRY)
         self._rows.append(new)
         return new
 
     def result(self) -> Result:
-        """Process what was pushed and return all that is known so far; more may be pushed afterwards."""
+        """Process what was pushed and return all results so far; more may be pushed afterwards."""
         self.update()
         navigator = self._navigator
         waiting = [
@@ -231,7 +236,7 @@ class Filter:
             for stamps, _ in parts
             for stamp in stamps.tolist()
         ]
-        # A copy ends here; the filter itself goes on.
+        # Only a copy is finished: the filter itself can go on.
         last = copy.deepcopy(navigator).finish()
         records = np.concatenate([np.zeros(0, RECORD), *self._records, last, *waiting])
         records = records[np.lexsort((records["source"], records["stream"], records["stamp"]))]
@@ -273,14 +278,14 @@ class Filter:
                 )
 
     def _offset(self, name: str) -> int:
-        """What the parameters add to the stamps of an input (ns)."""
+        """Return the time offset (ns) that the parameters add to the stamps of an input."""
         if name == "imu":
             return 0
         group = "gnss" if name in ("gnss_position", "gnss_velocity") else name
         return round(getattr(self._parameters, group).time_offset * SECOND)
 
     def _note(self, name: str, table: Table, stamps: Stamps) -> None:
-        """Keep what is said of a table later."""
+        """Remember the unused columns of a table and the span of its stamps, for warnings and errors."""
         unused = self._unused.setdefault(name, [])
         unused += [column for column in table.unused() if column not in unused]
         if len(stamps):
@@ -322,7 +327,7 @@ class Filter:
         self._aid_parts[name].append((stamps, rows))
 
     def _take_aids(self, newest: int | None) -> list[tuple[int, str, int, Array]]:
-        """Take what is not newer than the IMU: instant on its clock, input, stamp, row; in this order."""
+        """Take the measurements not newer than the IMU: (stamp on its clock, input, own stamp, row), sorted."""
         limit = max((stamp for stamp in (newest, self._newest) if stamp is not None), default=None)
         taken: list[tuple[int, str, int, Array]] = []
         for name, parts in self._aid_parts.items():
@@ -335,7 +340,7 @@ class Filter:
         return taken
 
     def _give(self, aids: list[tuple[int, str, int, Array]], is_first: bool) -> None:
-        """Offer measurements to the navigator; before the first IMU sample the newest ones it has room for."""
+        """Push measurements to the navigator; before the first IMU sample only the newest `EARLY_AIDS`."""
         dropped = max(0, len(aids) - EARLY_AIDS) if is_first else 0
         for _, name, stamp, _ in aids[:dropped]:
             record = (stamp, stamp, _KINDS[name].stream, 0, Verdict.BEFORE_ALIGNMENT, 0, math.nan, (math.nan,) * 3)
@@ -350,7 +355,7 @@ class Filter:
                 self._navigator.push(_KINDS[name].stream, stamp, row[:3].tolist(), row[3:12], stamp)
 
     def _drops(self, summary: dict[str, Any]) -> list[str]:
-        """One sentence for each input and reason for which rows of it were not used."""
+        """Return one sentence for each input and reason for which rows of it were not used."""
         lines = []
         for name, reason in IMU_DROPS.items():
             if count := summary["imu"][name]:
@@ -380,7 +385,7 @@ def run(
     output_rate: float = 0.0,
     **others: Any,
 ) -> Result:
-    """Run the filter over whole recordings: tables as in the head of this module, None for what there is not.
+    """Run the filter over whole recordings: tables as in the module docstring, None for missing ones.
 
     ``parameters`` and ``output_rate`` (Hz) as in `Filter`. ``others``: tables of measurements that you added, by name
     (``docs/add_a_measurement.md``).
@@ -388,7 +393,7 @@ def run(
     Raises:
         ValueError: a table cannot be used, or has no time in common with the IMU; the message says what to do.
         ParameterError: the parameters cannot be used.
-        TypeError: the parameters are of no type that is taken.
+        TypeError: the parameters have another type.
     """
     tables = {
         "gnss_position": gnss_position,
@@ -410,7 +415,7 @@ def run(
 
 
 def _end_of_chunk(stamps: Stamps, first: int, is_jump: bool) -> int:
-    """Where the IMU samples to be pushed at once end: within a second, or as many as make a jump believed."""
+    """Return the end of the IMU samples to be pushed at once: within a second, or enough to confirm a jump."""
     end = int(np.searchsorted(stamps, stamps[first] + SECOND))
     if is_jump:
         end = min(end, first + 2 * JUMP_CONFIRMATIONS)

@@ -1,7 +1,7 @@
 """Fast typed reading and writing of rosbag2 recordings.
 
-The node reads serialised messages with what is imported here at once. What opens files is imported when it is asked
-for: it needs libraries that a robot has no use for.
+The modules imported here decode serialised messages, which the node needs, too. The reader and the writer of files are
+imported on first use: they need libraries that a robot does not have.
 """
 
 from __future__ import annotations

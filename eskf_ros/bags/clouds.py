@@ -1,7 +1,7 @@
 """sensor_msgs/PointCloud2 in recordings: one message is a row of stamp, frame and its points.
 
 The points are a structured array with the fields of the sender, an object in the row: messages of one topic differ in
-the number of their points, and rows stay rows to whatever sorts, joins or takes them.
+the number of their points, but can still be sorted and joined as rows.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ CLOUD_DTYPE = np.dtype([("stamp", "i8"), ("frame_id", "i4"), ("points", "O")], a
 """``stamp`` ns, ``frame_id`` an index into the strings, ``points`` a structured array (n,), see `gnss.cloud`."""
 
 _MOST_FIELDS = 1000
+"""Fields of a point that are read, at most; more are damage."""
 
 
 def cloud_messages(stamps: NDArray[np.int64], clouds: Sequence[NDArray[Any]], frame_id: int = 0) -> NDArray[Any]:
@@ -68,7 +69,7 @@ def _fields(block: bytes, count: int, order: str) -> tuple[PointField, ...]:
 
 
 def _fields_end(data: bytes, start: int, count: int, order: str) -> int:
-    """Return where the fields end that begin at ``start`` (aligned to 4): `_fields` is fast for what it has seen."""
+    """Return the end of the fields that begin at ``start`` (aligned to 4); `_fields` is cached by their bytes."""
     length = struct.Struct(order + "I")
     position = start
     for _ in range(count):
@@ -79,7 +80,7 @@ def _fields_end(data: bytes, start: int, count: int, order: str) -> int:
 
 
 def decode_cloud(payload: NDArray[np.uint8], message: NDArray[Any], index: Callable[[str], int]) -> bool:
-    """Decode a serialised message into a row, ``message`` (1,) of CLOUD_DTYPE; False when it is none.
+    """Decode a serialised message into a row, ``message`` (1,) of CLOUD_DTYPE; return False if it is not a cloud.
 
     ``index`` gives the index of a frame id.
     """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def one_line(error: object) -> str:
-    """A text from elsewhere (a library's error may quote a whole SQL statement) without its line breaks."""
+    """Return the text of an error without line breaks: that of a library may quote a whole SQL statement."""
     return " ".join(line.strip() for line in str(error).splitlines())
 
 

@@ -1,9 +1,9 @@
 """Reading of MCAP files (https://mcap.dev/spec): chunks found by the index, messages gathered by numpy.
 
-A healthy recording ends with a summary: channels, counts and the place of every chunk. Behind each chunk lie the
-(time, offset) pairs of its messages, so the messages of a topic are one strided gather out of the decompressed chunk,
-without a Python statement per message. A file without a usable summary (cut off, damaged, or written without) is
-walked record by record once to build the same list of chunks, and so is a chunk without a message index.
+A healthy recording ends with a summary: channels, counts and the position of every chunk. After each chunk come the
+(time, offset) pairs of its messages, so the messages of a topic are one strided gather from the decompressed chunk,
+without a Python statement per message. A file without a usable summary (cut off, damaged, or written without) is walked
+record by record once to build the same list of chunks, and so is a chunk without a message index.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class _Messages:
 
 
 def _decompress(compression: str, data: bytes | memoryview, size: int, incomplete: bool) -> bytes | memoryview:
-    """Decompress a chunk of `size` bytes; `incomplete`: `data` is cut off, give what can be had."""
+    """Decompress a chunk of `size` bytes; `incomplete`: `data` is cut off, return as much as possible."""
     if compression == "":
         return data
     if size > _LARGEST_CHUNK:
@@ -87,7 +87,7 @@ def _decompress(compression: str, data: bytes | memoryview, size: int, incomplet
 
 
 def _open_chunk(record: bytes | memoryview, incomplete: bool) -> tuple[memoryview, int, int]:
-    """The uncompressed records of a chunk and its first and last time; raises _Damage."""
+    """Return the uncompressed records of a chunk and its first and last time; raises _Damage."""
     try:
         opcode, length = _PREFIX.unpack_from(record)
         start, end, size, crc = _CHUNK_HEADER.unpack_from(record, 9)
@@ -112,7 +112,7 @@ class McapFile:
     """One .mcap file as a `Source`."""
 
     def __init__(self, path: Path) -> None:
-        """Read the summary, or scan the file where there is none.
+        """Read the summary, or scan the file if there is none.
 
         Raises:
             BagError: the file cannot be opened or is no MCAP file.
@@ -146,7 +146,7 @@ class McapFile:
 
     @property
     def warnings(self) -> list[str]:
-        """What was wrong so far, one line each."""
+        """Faults found so far, one line each."""
         if not self._skipped:
             return self._warnings
         offset, reason = next(iter(self._skipped.items()))
@@ -155,10 +155,10 @@ class McapFile:
         return [*self._warnings, f"{self.path}: {chunks} at byte {offset} ({reason})"]
 
     def close(self) -> None:
-        """Nothing stays open between reads."""
+        """Do nothing: no file stays open between reads."""
 
     def _read_at(self, file: BinaryIO, offset: int, size: int) -> bytes:
-        """Up to `size` bytes; offset and size may come from a damaged record."""
+        """Return up to `size` bytes; offset and size may come from a damaged record."""
         available = self.bytes_total - offset
         if available <= 0:
             return b""
@@ -170,7 +170,7 @@ class McapFile:
         return schema.name if schema else ""
 
     def _read_summary(self, file: BinaryIO) -> bool:
-        """Channels, counts and chunks from the end of the file; False if they are not all there."""
+        """Read channels, counts and chunks from the end of the file; return False if they are incomplete."""
         tail = self._read_at(file, max(0, self.bytes_total - _FOOTER_SIZE - len(MAGIC)), _FOOTER_SIZE + len(MAGIC))
         if not tail.endswith(MAGIC) or len(tail) != _FOOTER_SIZE + len(MAGIC):
             return False
@@ -217,7 +217,7 @@ class McapFile:
         return True
 
     def _is_complete(self, statistics: Statistics) -> bool:
-        """Whether the summary describes every message: all channels, all chunks, none outside a chunk."""
+        """Return whether the summary describes every message: all channels, all chunks, none outside a chunk."""
         if len(self._channels) < statistics.channel_count or len(self._chunks) != statistics.chunk_count:
             return False
         if any(channel.schema_id and channel.schema_id not in self._schemas for channel in self._channels.values()):
@@ -241,7 +241,7 @@ class McapFile:
     def _scan(self, file: BinaryIO) -> None:
         """Walk the records from the start and list the chunks and the messages outside chunks.
 
-        Stops at the first record that is cut off or makes no sense and says so; what lies before it is used.
+        Stops, with a warning, at the first record that is cut off or damaged; the records before it are used.
         """
         position = len(MAGIC)
         loose: _Chunk | None = None
@@ -296,14 +296,14 @@ class McapFile:
         self.start_time, self.end_time = (first, last) if self._chunks else (0, 0)
 
     def _survey(self, raw: memoryview) -> NDArray[np.int64]:
-        """Note the channels and message counts of a chunk; returns the message times."""
+        """Count the messages of a chunk by channel; return their times."""
         messages = self._walk(raw)
         for number, count in zip(*np.unique(messages.channel, return_counts=True), strict=True):
             self._counts[int(number)] = self._counts.get(int(number), 0) + int(count)
         return messages.log_time
 
     def _walk(self, raw: memoryview) -> _Messages:
-        """Find the messages in a run of records one by one; channels and schemas on the way are noted."""
+        """Find the messages in a run of records one by one; remember channels and schemas on the way."""
         channels: list[int] = []
         times: list[int] = []
         offsets: list[int] = []
@@ -369,7 +369,7 @@ class McapFile:
     def _indexed(
         self, raw: memoryview, index: memoryview, chunk: _Chunk, wanted: dict[int, str]
     ) -> dict[str, NDArray[np.int64]] | None:
-        """Offsets of the messages of each wanted topic by the message index; None if that does not fit the chunk."""
+        """Return the offsets of the messages of each wanted topic by the message index; None if the index is wrong."""
         found: dict[str, list[NDArray[np.int64]]] = {}
         for number, offset in chunk.index_offsets.items():
             if number not in wanted:
@@ -386,7 +386,7 @@ class McapFile:
             if not _are_messages(raw, offsets, number):
                 return None
             found.setdefault(wanted[number], []).append(offsets)
-        # The index may list messages in another order than they lie in the file.
+        # The order of the index may differ from that of the file.
         return {topic: np.sort(np.concatenate(parts)) for topic, parts in found.items()}
 
     def _walked(self, raw: memoryview, wanted: dict[int, str]) -> dict[str, NDArray[np.int64]]:
@@ -401,13 +401,13 @@ class McapFile:
 
 
 def _gather(raw: memoryview, offsets: NDArray[np.int64], size: int) -> NDArray[np.void]:
-    """The `size` bytes at each of `offsets` (all inside `raw`): one copy each, no Python loop."""
+    """Return the `size` bytes at each of `offsets` (all inside `raw`): one copy each, no Python loop."""
     windows = np.ndarray((len(raw) - size + 1,), f"V{size}", raw, 0, (1,))
     return cast("NDArray[np.void]", windows[offsets])
 
 
 def _are_messages(raw: memoryview, offsets: NDArray[np.int64], channel: int) -> bool:
-    """Whether at every offset lies a whole message record of the channel."""
+    """Return whether a whole message record of the channel lies at every offset."""
     if int(offsets.min()) < 0 or int(offsets.max()) > len(raw) - _PAYLOAD_OFFSET:
         return False
     heads = _gather(raw, offsets, 11).view([("opcode", "u1"), ("length", "<i8"), ("channel", "<u2")])

@@ -9,11 +9,11 @@ In memory a message is one row of `message_dtype(type_name)`:
 - a string is an int32: its index in a `StringTable`, because nearly all messages of a topic carry the same frame id;
 - everything else is the number or the fixed-length array of the definition (quaternions stay x y z w).
 
-Point clouds have as many points, and these as many fields, as the sender likes: `eskf_ros.bags.clouds`.
+Point clouds have variable fields and a variable number of points: `eskf_ros.bags.clouds`.
 
 On the wire (OMG CDR, the encoding of rosbag2): 4 bytes of encapsulation (00 01 00 00 little-endian, 00 00 00 00
 big-endian), then the fields, each aligned to its own size counted from byte 4; a string is a uint32 length that counts
-the closing NUL, then the bytes. So where a field lies depends only on the lengths of the strings before it, and
+the closing NUL, then the bytes. The position of a field thus depends only on the lengths of the strings before it, and
 messages with equal string lengths are decoded together by one structured view.
 """
 
@@ -90,7 +90,7 @@ MESSAGE_TYPES: dict[str, tuple[Field, ...]] = {
     "geometry_msgs/msg/PoseWithCovarianceStamped": (*_HEADER, *_POSE),
     "nav_msgs/msg/Odometry": (*_HEADER, Field("child_frame_id", _STRING), *_POSE, *_TWIST),
 }
-"""The messages of fixed fields; that of `POINT_CLOUD` has fields of its own, see `eskf_ros.bags.clouds`."""
+"""The messages with fixed fields; those of `POINT_CLOUD` have variable ones, see `eskf_ros.bags.clouds`."""
 
 
 class StringTable:
@@ -103,7 +103,7 @@ class StringTable:
             self.index(value)
 
     def index(self, value: str) -> int:
-        """The index of `value`, added at the end if it is new."""
+        """Return the index of `value`, which is appended if it is new."""
         found = self._index.get(value)
         if found is None:
             found = self._index[value] = len(self.values)
@@ -121,7 +121,7 @@ def _fields_of(type_name: str) -> tuple[Field, ...]:
 
 @cache
 def message_dtype(type_name: str) -> np.dtype[Any]:
-    """The structured dtype of one message in memory. Raises BagError for a type that is not among those above."""
+    """Return the structured dtype of one message in memory. Raises BagError for an unknown type."""
     if type_name == POINT_CLOUD:
         return CLOUD_DTYPE
     memory_code = {_TIME: "i8", _STRING: "i4"}
@@ -135,10 +135,10 @@ def message_dtype(type_name: str) -> np.dtype[Any]:
 
 
 class _Layout(NamedTuple):
-    """Where the fields of a message lie on the wire, for one set of string lengths and one byte order.
+    """Positions of the fields of a message on the wire, for one set of string lengths and one byte order.
 
     `wire` and `memory` are structured dtypes with the same field names: assigning one to the other moves everything but
-    times and strings. Neighbouring fields that lie the same way in both are merged to one block, copied as bytes.
+    times and strings. Neighbouring fields with the same layout in both are merged to one block, copied as bytes.
     """
 
     wire: np.dtype[Any]
@@ -154,7 +154,7 @@ def _align(position: int, size: int) -> int:
 
 @lru_cache(maxsize=1024)
 def _layout(type_name: str, string_sizes: tuple[int, ...], order: str) -> _Layout:
-    """Lay the fields out. `string_sizes` are in bytes, the NUL counted; `order` is "<" or ">"."""
+    """Return the layout of a message. `string_sizes` are in bytes, the NUL counted; `order` is "<" or ">"."""
     memory_dtype = message_dtype(type_name)
     seconds: dict[str, int] = {}
     lengths: dict[str, int] = {}
@@ -206,12 +206,12 @@ def _native(code: str) -> str:
 
 
 def _column(rows: NDArray[np.uint8], offset: int, code: str) -> NDArray[Any]:
-    """The number at byte `offset` of every row, as a view."""
+    """Return the number at byte `offset` of every row, as a view."""
     return np.ndarray((rows.shape[0],), code, rows, offset, (rows.shape[1],))  # type: ignore[call-overload,no-any-return]
 
 
 def _structured(rows: NDArray[np.uint8], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """A structured view of the start of every row."""
+    """Return a structured view of the start of every row."""
     return np.ndarray((rows.shape[0],), dtype, rows, 0, (rows.shape[1],))
 
 
@@ -226,10 +226,10 @@ def decode(
     Args:
         type_name: a key of `MESSAGE_TYPES`.
         rows: (n, length) contiguous bytes, one serialised message per row.
-        strings: where the strings of the messages are found or added.
+        strings: the table in which the strings of the messages are looked up or added.
 
     Returns:
-        The messages, structured, shape (n,); and None, or, when some rows are no such message (too short, another
+        The messages, structured, shape (n,); and None or, if some rows are no such message (too short, another
         encoding), a bool array (n,) that is False for them (their contents are then meaningless).
 
     Raises:
@@ -255,7 +255,7 @@ def _decode_into(
     sizes: list[int] = []
     deciding = [_column(rows, 0, "u2")] if order else []
     for number, field in enumerate(field for field in _fields_of(type_name) if field.code == _STRING):
-        # The lengths found so far say where the next length lies.
+        # The lengths of the strings before it determine the position of the next length.
         offset = _layout(type_name, (*sizes, *(0,) * (_string_count(type_name) - number)), order or "<").lengths[
             field.name
         ]
@@ -270,7 +270,7 @@ def _decode_into(
     for column in deciding:
         same = column == column[0]
         if not same.all():
-            # The first row differs from others in byte order or a string length: decode its like, then the rest.
+            # Rows differ in byte order or a string length: decode those like the first row, then the others.
             for chosen in (same, ~same):
                 part, part_valid = np.empty(int(chosen.sum()), messages.dtype), np.ones(int(chosen.sum()), bool)
                 _decode_into(part, part_valid, type_name, rows[chosen], strings)
@@ -302,7 +302,7 @@ def _structured_messages(messages: NDArray[Any], dtype: np.dtype[Any]) -> NDArra
 
 
 def _intern(text: NDArray[np.uint8], strings: StringTable) -> int | NDArray[np.int32]:
-    """Indices of the strings in the rows of `text`, (n, size) bytes; one int if all are equal."""
+    """Return the indices of the strings in the rows of `text`, (n, size) bytes; one int if all are equal."""
     if text.shape[1] == 0 or (text == text[0]).all():
         return strings.index(_text(text[0].tobytes()))
     values, inverse = np.unique(np.ascontiguousarray(text).view(f"S{text.shape[1]}")[:, 0], return_inverse=True)
@@ -319,10 +319,10 @@ def encode(type_name: str, messages: NDArray[Any], strings: Sequence[str]) -> ND
     Args:
         type_name: a key of `MESSAGE_TYPES`.
         messages: structured, (n,), of dtype `message_dtype(type_name)`.
-        strings: what the string fields of the messages are indices into.
+        strings: the strings whose indices are in the string fields of the messages.
 
     Returns:
-        (n, length) bytes, or a list of n byte strings when their lengths differ.
+        (n, length) bytes, or a list of n byte strings if their lengths differ.
 
     Raises:
         BagError: the type is unknown.
@@ -344,7 +344,7 @@ def encode(type_name: str, messages: NDArray[Any], strings: Sequence[str]) -> ND
 def encode_groups(
     type_name: str, messages: NDArray[Any], strings: Sequence[str]
 ) -> Iterator[tuple[slice | NDArray[np.intp], NDArray[np.uint8]]]:
-    """As `encode`, but in groups of equal length: yields (which messages, their bytes (m, length))."""
+    """Yield groups of equal length, encoded as by `encode`: (which messages, their bytes (m, length))."""
     if type_name == POINT_CLOUD:
         payloads = [encode_cloud(message, strings[int(message["frame_id"])]) for message in messages]
         if payloads:

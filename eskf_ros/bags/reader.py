@@ -24,7 +24,7 @@ _BATCH_MESSAGES = 8192  # smaller batches are collected: a bag with images has f
 
 @dataclass
 class _Piece:
-    """Decoded messages of one topic out of one block, sorted like a batch; `order` is the place of the block."""
+    """Decoded messages of one topic from one block, sorted like a batch; `order` is the position of the block."""
 
     order: tuple[int, int]
     log_time: NDArray[np.int64]
@@ -38,15 +38,15 @@ class BagReader:
         topics: type and message count of every topic (of all types, readable or not).
         start_time, end_time: log times of the first and the last message, ns.
         bytes_total, bytes_done: progress of `batches`, in bytes of the files.
-        strings: the frame ids met so far; `frame_id` of all batches are indices into it.
-        warnings: what is wrong with the recording, one line each; complete when `batches` is through.
+        strings: the frame ids read so far; `frame_id` of all batches are indices into it.
+        warnings: faults of the recording, one line each; complete when `batches` is exhausted.
     """
 
     def __init__(self, sources: Sequence[Source], warnings: Sequence[str] = ()) -> None:
-        """`sources` are opened files, in the order given by the user.
+        """Take opened files (`sources`) in the order given by the user.
 
         Raises:
-            BagError: they hold no message, or disagree about the type of a topic.
+            BagError: they have no message, or disagree about the type of a topic.
         """
         self._sources = sources
         self._own_warnings = list(warnings)
@@ -69,12 +69,12 @@ class BagReader:
 
     @property
     def warnings(self) -> list[str]:
-        """What was wrong so far, one line each."""
+        """Faults found so far, one line each."""
         return [*self._own_warnings, *(line for source in self._sources for line in source.warnings)]
 
     @property
     def strings(self) -> Sequence[str]:
-        """The frame ids met so far."""
+        """The frame ids read so far."""
         return self._strings.values
 
     def close(self) -> None:
@@ -92,8 +92,8 @@ class BagReader:
         """Read the recording once, from start to end.
 
         Batches follow each other in log time without overlap (all times of one are below all times of the next); each
-        holds the topics that have messages in it. Memory is bounded by a few blocks of the file: where the time ranges
-        of blocks overlap, the newer messages wait until the older blocks are read.
+        holds the topics that have messages in it. Memory is bounded by a few blocks of the file: if the time ranges of
+        blocks overlap, the newer messages wait until the older blocks are read.
 
         Args:
             topics: topic name -> message type, as in {"imu/data": "sensor_msgs/msg/Imu"}.
@@ -113,9 +113,9 @@ class BagReader:
         return self._batches(topics)
 
     def serialised(self, topics: Iterable[str]) -> Iterator[tuple[str, Payloads]]:
-        """Read the recording once and give out the messages as they are stored: (topic, messages) in no strict order.
+        """Read the recording once and yield the messages as they are stored: (topic, messages), not strictly in order.
 
-        Blocks come by their start, so that what is far apart in time comes in order. For topics of any type.
+        Blocks come by their start time, so that messages far apart in time come in order. Topics may have any type.
         """
         for _, block in self._blocks({topic: self.topics[topic].type for topic in topics}):
             yield from block.load().items()
@@ -164,7 +164,7 @@ class BagReader:
             )
 
     def _blocks(self, topics: Mapping[str, str]) -> Iterator[tuple[tuple[int, int], Block]]:
-        """The blocks of all sources in the order of their start, with their place (source, position)."""
+        """Yield the blocks of all sources in the order of their start, with their position (source, position)."""
 
         def of_source(number: int, source: Source) -> Iterator[tuple[int, tuple[int, int], Block]]:
             for block in source.blocks(topics):
@@ -175,7 +175,7 @@ class BagReader:
             yield order, block
 
     def _decode(self, type_name: str, payloads: Payloads, order: tuple[int, int]) -> tuple[_Piece, int]:
-        """Decode and sort the messages of a block; also returns how many cannot be decoded."""
+        """Decode and sort the messages of a block; return also how many cannot be decoded."""
         log_time = payloads.log_time
         keep: NDArray[np.bool_] | None = None
         if len(payloads.groups) == 1 and payloads.groups[0][0] is None:
@@ -267,7 +267,7 @@ def _open_file(path: Path) -> Source:
 
 
 def _open_directory(path: Path, warnings: list[str]) -> list[Source]:
-    """The files of a rosbag2 directory; files that cannot be opened become warnings as long as one can."""
+    """Return the files of a rosbag2 directory; unreadable files become warnings as long as one can be opened."""
     metadata = path / "metadata.yaml"
     files = sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))
     if metadata.exists():

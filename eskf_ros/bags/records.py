@@ -1,4 +1,4 @@
-"""What the file formats have in common: a recording is a sequence of blocks of serialised messages."""
+"""Records that the file formats share: a recording is a sequence of blocks of serialised messages."""
 
 from __future__ import annotations
 
@@ -64,9 +64,9 @@ class Source(Protocol):
     def warnings(self) -> list[str]: ...
 
     def blocks(self, topics: Mapping[str, str]) -> Iterator[Block]:
-        """The blocks that hold messages of `topics` (name -> type) in the order of their start.
+        """Yield the blocks with messages of `topics` (name -> type) in the order of their start.
 
-        A block is loaded before the next one is asked for.
+        A block is loaded before the next one is requested.
         """
         ...
 
@@ -74,7 +74,7 @@ class Source(Protocol):
 
 
 def group_by_length(payloads: Sequence[bytes]) -> list[tuple[NDArray[np.intp] | None, NDArray[np.uint8]]]:
-    """Byte strings as groups of equal length, see `Payloads`."""
+    """Return byte strings in groups of equal length, see `Payloads`."""
     lengths = np.fromiter(map(len, payloads), np.intp, len(payloads))
     distinct = np.unique(lengths)
     if len(distinct) == 1:

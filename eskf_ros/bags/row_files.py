@@ -1,4 +1,4 @@
-"""Recordings that give one message at a time: sqlite3 files, and what only the rosbags library reads."""
+"""Recordings read message by message: sqlite3 files, and directories that only the rosbags library reads."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class _RowSource:
             yield Block(first[1], position, int(count * bytes_per_row), load)
 
     def _survivors(self, wanted: Mapping[str, int]) -> Iterator[Row]:
-        """The rows up to the first damage, which becomes a warning."""
+        """Yield the rows up to the first damage, which becomes a warning."""
         rows = self._rows(wanted)
         done = 0
         while True:
@@ -108,7 +108,7 @@ class SqliteFile(_RowSource):
         self.name = str(path)
         self.warnings = []
         self.bytes_total = path.stat().st_size
-        # With a write-ahead log beside it (a recorder that was killed) the newest messages are in there.
+        # A write-ahead log beside the file (of a recorder that was killed) contains the newest messages.
         access = "mode=ro" if path.with_name(path.name + "-wal").exists() else "mode=ro&immutable=1"
         self._copy = _without_partial_page(path)
         address = (Path(self._copy.name) if self._copy else path.absolute()).as_uri()
@@ -175,9 +175,9 @@ class SqliteFile(_RowSource):
 
 
 def _without_partial_page(path: Path) -> IO[bytes] | None:
-    """A temporary copy without the last page, if that page is cut off.
+    """Return a temporary copy without the last page, if that page is cut off, else None.
 
-    sqlite3 would fill it up with zeros and give out the message that lies across the cut as if it were whole.
+    sqlite3 would fill the page with zeros and return the message across the cut as if it were complete.
     """
     with path.open("rb") as file:
         (page_size,) = struct.unpack(">16xH", file.read(18).ljust(18, b"\x00"))

@@ -1,7 +1,8 @@
 """Writing of MCAP files: whole chunks assembled by numpy.
 
-The file is what `ros2 bag record` would leave for the mcap storage (profile ros2, schemas ros2msg, message and chunk
-index, statistics, the rosbag2 metadata record), and holds no wall-clock time: the same calls give the same bytes.
+The file has the form that `ros2 bag record` gives it with mcap storage (profile ros2, schemas ros2msg, message and
+chunk index, statistics, the rosbag2 metadata record), and contains no wall-clock time: the same calls give the same
+bytes.
 """
 
 from __future__ import annotations
@@ -82,7 +83,7 @@ class _Summary:
 
 
 class BagWriter:
-    """Writes one .mcap file; a context manager. An exception inside leaves a file without index, still readable."""
+    """Writes one .mcap file; a context manager. After an exception inside the file has no index, but can be read."""
 
     def __init__(self, path: Path, compression: str = "zstd") -> None:
         """Create the file, replacing one of that name. `compression` is zstd, lz4 or none.
@@ -120,7 +121,7 @@ class BagWriter:
                 self._file.close()
 
     def add_topic(self, name: str, type_name: str) -> int:
-        """Announce a topic; returns the handle for `write`.
+        """Announce a topic; return the handle for `write`.
 
         Raises:
             BagError: the type is unknown to ROS 2 Jazzy's common messages, or the topic has been added before.
@@ -154,14 +155,14 @@ class BagWriter:
     ) -> None:
         """Write messages of one topic.
 
-        Messages of all topics are sorted by log time (equal times: as written) as far as they are written within some
+        Messages of all topics are sorted by log time (equal times: as written) if they are written within some
         megabytes of each other; later ones come in later chunks, which readers merge.
 
         Args:
             handle: from `add_topic`.
             log_time: (n,) ns.
             messages: n messages: structured (see `message_dtype`), or serialised: (n, length) uint8, or n byte strings.
-            strings: what the string fields of structured messages are indices into.
+            strings: the strings whose indices are in the string fields of structured messages.
 
         Raises:
             BagError: structured messages of a type that cannot be encoded, or the disk is full.
@@ -186,7 +187,7 @@ class BagWriter:
         topic.newest = max(int(log_time.max()), topic.newest if topic.newest is not None else int(log_time.max()))
         self._written += len(log_time)
         if self._pending_bytes > _BUFFER_BYTES:
-            # Up to here no topic is expected to bring anything older.
+            # No topic is expected to write anything older than its newest message.
             complete = min(topic.newest for topic in self._topics if topic.newest is not None)
             self._flush(complete)
             if self._pending_bytes > 2 * _BUFFER_BYTES:
@@ -195,7 +196,7 @@ class BagWriter:
     def _append(
         self, topic: _Topic, log_time: NDArray[np.int64], chosen: slice | NDArray[np.intp], payload: NDArray[np.uint8]
     ) -> None:
-        """Put the message records of equal length in line."""
+        """Queue the message records of equal length."""
         count, length = payload.shape
         times = log_time[chosen]
         order = self._written + np.arange(len(log_time), dtype=np.int64)[chosen]
@@ -251,7 +252,7 @@ class BagWriter:
         part: NDArray[np.intp],
         parts: list[tuple[_Records, int, int]],
     ) -> None:
-        """Write one chunk of messages given by time, offset in the chunk and which part they are the next of."""
+        """Write one chunk of messages, given by time, offset in the chunk, and the part whose next record each is."""
         last = parts[int(part[-1])][0].rows.shape[1]
         raw = np.empty(int(offsets[-1]) + last, np.uint8)
         index: dict[int, list[tuple[NDArray[np.int64], NDArray[np.int64]]]] = {}
@@ -308,7 +309,7 @@ class BagWriter:
         return BagError(f"{self.path}: cannot be written ({error.strerror})")
 
     def close(self) -> None:
-        """Write what waits, the index and the footer.
+        """Write the waiting messages, the index and the footer.
 
         Raises:
             BagError: the disk is full.
@@ -355,7 +356,7 @@ class BagWriter:
             raise self._failure(error) from error
 
     def _rosbag2_metadata(self) -> str:
-        """What `ros2 bag` keeps in metadata.yaml, as JSON (which YAML includes)."""
+        """Return the content of metadata.yaml of `ros2 bag`, as JSON (which is valid YAML)."""
         start = self._summary.start or 0
         return json.dumps(
             {
@@ -394,7 +395,7 @@ def _record(record: McapRecord) -> bytes:
 
 
 def _message_index(channel: int, entries: NDArray[np.int64]) -> bytes:
-    """A message index record; `entries` (n, 2) are log times and offsets."""
+    """Return a message index record; `entries` (n, 2) are log times and offsets."""
     body = entries.astype("<u8").tobytes()
     return b"".join(
         (

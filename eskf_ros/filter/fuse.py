@@ -1,8 +1,8 @@
-"""One measurement on its way from the timeline to its verdict. ``linearize`` is the list of aids."""
+"""Fusion of one measurement, from the timeline to its verdict; `linearize` lists the measurement models."""
 
 from __future__ import annotations
 
-from eskf_ros.compiled import njit
+from eskf_ros.compiled import njit, njit_in_caller
 from eskf_ros.filter.alignment.first_fix import reset_position_to_fix
 from eskf_ros.filter.alignment.heading import reset_heading_from_memory, search_heading
 from eskf_ros.filter.alignment.heading_from_wheels import search_with_wheels
@@ -46,15 +46,15 @@ MEASUREMENTS = (
     zaru.ROW,
     nhc.ROW,
 )
-"""The facts of the measurements that `linearize` knows; signals of satellites are in `tight`."""
+"""The rows of the measurements that `linearize` knows; the signals of satellites are in `tight`."""
 
 UNKNOWN_STREAM = -1
-"""Instead of a size, for a stream without a branch in `linearize`: it is refused with a record, never fused."""
+"""Size for a stream without a branch in `linearize`: its messages are refused with a record, never fused."""
 
 
-@njit
+@njit_in_caller
 def fuse(state, aids, i, settings, work):
-    """Offer one measurement to the state and leave the verdict in its record."""
+    """Fuse or refuse one measurement; write the verdict to its record."""
     if not open_record(aids, i):
         return
     aid = aids[i]
@@ -67,14 +67,14 @@ def fuse(state, aids, i, settings, work):
     note_jump(state, position_before, heading_before, settings)
 
 
-@njit
+@njit_in_caller
 def offer(state, aid, heading_before, settings, work):
-    """Fuse one measurement or refuse it; ``heading_before`` (rad) is that of the prediction."""
+    """Fuse one measurement or refuse it; ``heading_before`` (rad) is the predicted heading."""
     if not is_aligned_for(state, settings.needs[aid.stream]):
         wait_for_alignment(state, aid, settings, work)
         return
     if aid.stream == Stream.HEADING and aid.source == heading.IMU_ORIENTATION and state.heading_known == 1:
-        # It is made of the same IMU: good for a start, and nothing new afterwards.
+        # It comes from the same IMU: useful for the initial heading, no new information afterwards.
         aid.verdict = Verdict.INACTIVE
         return
     update_error_size(state, settings.reach[aid.stream], settings)
@@ -97,7 +97,7 @@ def offer(state, aid, heading_before, settings, work):
 
 @njit
 def update_motion_evidence(state, aid, settings):
-    """Note what a measurement says of place, course, motion and rest: that counts whatever becomes of it."""
+    """Look in a measurement for motion, rest, position and course: all count even if the measurement is refused."""
     if aid.stream == Stream.GNSS_POSITION:
         if update_evidence_from_fix(state, aid):
             reset_level_to_moving(state, settings)
@@ -109,18 +109,18 @@ def update_motion_evidence(state, aid, settings):
         reset_level_to_moving(state, settings)
 
 
-@njit
+@njit_in_caller
 def wait_for_alignment(state, aid, settings, work):
-    """Leave a measurement that comes too early; wheels help to find the heading before they are fused."""
+    """Refuse a measurement that comes before its alignment; wheels take part in the search for the heading."""
     if aid.stream == Stream.WHEEL:
         search_with_wheels(state, aid.payload, settings.gate[Stream.WHEEL.value, 2], settings, work)
         watch_wheels(state, aid)
     aid.verdict = Verdict.BEFORE_ALIGNMENT if aid.stream < SENSOR_STREAMS else Verdict.INACTIVE
 
 
-@njit
+@njit_in_caller
 def begin(state, aid, settings):
-    """Take the position from the first fix, and the heading from memory if the robot is where it was left."""
+    """Set the position to the first fix, and the heading from memory if the robot is where it was left."""
     position = (state.position_map[0], state.position_map[1], state.position_map[2])
     heading_before = heading_of(state, settings)
     reset_position_to_fix(state, aid.payload)
@@ -128,11 +128,11 @@ def begin(state, aid, settings):
     note_jump(state, position, heading_before, settings)
 
 
-@njit
+@njit_in_caller
 def measure(state, aid, heading_before, settings, work):
-    """Write innovation, Jacobian and noise to ``work`` and return the size; 0 and a verdict if it is not to be fused.
+    """Write innovation, Jacobian and noise to ``work``; return the size, or 0 with a verdict for what is not fused.
 
-    A heading is what the first of those that tell it makes known: the measurement is linearized anew there.
+    A heading sensor may set the unknown heading here; its measurement is then linearized anew.
     """
     if aid.stream == Stream.MAG:
         mag.propagate_mag_error(state, heading_before, settings)
@@ -164,7 +164,7 @@ def measure(state, aid, heading_before, settings, work):
 
 @njit
 def is_aligned_for(state, needs):
-    """Say whether the start-up is far enough for a measurement with these needs (sum of NEEDS_... of its row)."""
+    """Say whether the alignment has what a measurement needs (sum of NEEDS_... of its row)."""
     if state.level_known == 0:
         return False
     if needs & NEEDS_POSITION and state.position_known == 0:
@@ -176,9 +176,9 @@ def is_aligned_for(state, needs):
 
 @njit
 def linearize(state, aid, settings, work):
-    """Write innovation, Jacobian and noise of one measurement to ``work``; return its size. The list of aids.
+    """Write innovation, Jacobian and noise of one measurement to ``work``; return its size.
 
-    Size 0: the measurement says nothing in this state. `UNKNOWN_STREAM`: nothing here knows what it measures.
+    Size 0: the measurement says nothing in this state. `UNKNOWN_STREAM`: there is no model for the stream.
     """
     if aid.stream == Stream.GNSS_POSITION:
         return gnss_position.linearize(state, aid.payload, aid.source, settings, work)

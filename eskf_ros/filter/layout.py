@@ -4,7 +4,7 @@ Everything the compiled kernels touch is a numpy record with named fields, so th
 code compiled and plain, and a checkpoint is one assignment. Units are SI; stamps are integer nanoseconds. A room
 defines its own record, in the file that writes it; a kernel says with ``state.ROOM.field`` whose memory it touches.
 
-Body axes are the axes of the IMU and the body origin is the IMU: biases, noise and lever arms live there.
+Body axes are the axes of the IMU and the body origin is the IMU: biases, noise and lever arms refer to them.
 ``output/global_odometry.py`` turns the result into base_link.
 """
 
@@ -55,7 +55,7 @@ STATE = np.dtype(
         ("attitude", "f8", (4,)),
         ("accel_bias", "f8", (3,)),
         ("gyro_bias", "f8", (3,)),
-        # Augmented states in the order of their places; how many errors are in use, the core's included.
+        # Augmented states in the order of their indices; how many errors are active, the core's included.
         ("optional", "f8", (OPTIONAL_CAPACITY,)),
         ("error_size", "i8"),
         # Covariance of the first ``error_size`` errors; the attitude error is a small rotation on the map side.
@@ -63,7 +63,7 @@ STATE = np.dtype(
         # Raw IMU reading at ``stamp``.
         ("specific_force", "f8", (3,)),
         ("angular_rate", "f8", (3,)),
-        # How far the start is, the first stamp of this start, and how often it was started again.
+        # What the alignment has found, its first stamp, and how often it was restarted.
         ("level_known", "i8"),
         ("position_known", "i8"),
         ("heading_known", "i8"),
@@ -90,7 +90,7 @@ STATE = np.dtype(
     ],
     align=True,
 )
-"""One state of the estimator: all it knows and all it decides with. Copying it is a checkpoint."""
+"""One state of the estimator: all it knows and all it decides with. A copy is a checkpoint."""
 
 SETTINGS = np.dtype(
     [
@@ -146,12 +146,12 @@ SETTINGS = np.dtype(
     ],
     align=True,
 )
-"""Parameters as the kernels use them: radians, body axes, gate thresholds by stream and degrees of freedom.
+"""Parameters as the kernels use them: radians, body axes, innovation gates by stream and degrees of freedom.
 
-``reach``: how many errors have to be in use for a measurement of a stream. ``constrains``: which constraints are
-switched on. ``needs``: what has to be known before a measurement of a stream is fused. ``NAME_at``: place of an
-augmented error, or `NOWHERE`. ``optional_*``, from the first place behind the core: standard deviation at first, white
-noise that drives it (unit/rtHz), inverse correlation time (1/s). The records behind them belong to the measurements.
+``reach``: errors that must be active for a measurement of a stream. ``constrains``: which constraints are switched on.
+``needs``: what must be known before a measurement of a stream is fused. ``NAME_at``: index of an augmented state, or
+`NOWHERE`. ``optional_*``, from the first index behind the core: initial standard deviation, process noise density
+(unit/rtHz), inverse correlation time (1/s). The records behind ``NAME_at`` belong to the measurements.
 """
 
 
@@ -170,7 +170,7 @@ WORK = np.dtype(
         ("gain", "f8", (ERROR_CAPACITY, 3)),
         ("residual_gain", "f8", (ERROR_CAPACITY, 3)),
         ("correction", "f8", (ERROR_CAPACITY,)),
-        # The signals of one epoch, and their least squares (see ``ranges``).
+        # The signals of one epoch, and their least squares (see ``tight``).
         ("signal_count", "i8"),
         ("signal_index", "i8", (LARGEST_EPOCH,)),
         ("signal_innovation", "f8", (LARGEST_EPOCH,)),
@@ -189,7 +189,12 @@ WORK = np.dtype(
 )
 """Scratch memory of the kernels: nothing is allocated per sample.
 
-``shared``: covariance of the noise of a measurement with the errors, zero but where an aid says otherwise.
+- ``half``, ``turned``: the covariance after one side of the transition, and its transpose.
+- ``jacobian``, ``innovation``, ``noise``: the measurement to fuse; ``shared``: covariance of its noise with the errors,
+  zero unless the measurement writes it.
+- ``projected`` ... ``correction``: intermediate results of the update.
+- ``effect``: derivative of the measurement by the faults of its receiver (`receiver_monitor`).
+- ``signal_*`` ... ``step``: the signals of one epoch and their least squares.
 """
 
 
@@ -230,7 +235,7 @@ _NEVER = {
         "heading_mark_stamp",
     ),
 }
-"""Stamps, by room, of what has not happened before the first sample."""
+"""Stamps that are `NEVER` in the blank state, by room."""
 
 
 def blank_state() -> np.ndarray:
@@ -244,6 +249,6 @@ def blank_state() -> np.ndarray:
     state["attitude"][0, 0] = 1.0
     state["levelling"]["kept_gyro_variance"] = np.inf
     state["error_size"] = ERROR_SIZE
-    # Until there are two samples: longer than any gap, so that the first interval takes no bend from an earlier one.
+    # Longer than any gap: the first interval is integrated without a curvature from an earlier one.
     state["imu"]["interval"] = 1e9
     return state

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from eskf_ros.compiled import njit
+from eskf_ros.compiled import njit, njit_in_caller
 from eskf_ros.filter.alignment.levelling import update_level
 from eskf_ros.filter.fuse import fuse
 from eskf_ros.filter.history.timeline import rewind, save_checkpoint
@@ -19,14 +19,14 @@ from eskf_ros.filter.stationarity.static_window import Window, close_static_wind
 from eskf_ros.filter.tight.epoch import end_of_epoch, fuse_ranges, is_range
 
 LONGEST_GAP = 5 * SECOND
-"""The IMU was silent for longer (ns): nothing is left of attitude and velocity, start again."""
+"""ns; after a longer silence of the IMU the alignment restarts: attitude and velocity are lost."""
 
 
 @njit
 def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, locals_, rows):
-    """Run the filter over all that waits, in the total order; return how many rows were written.
+    """Run the filter over all waiting messages in the total order; return the number of rows written.
 
-    One row for every IMU sample that is new and first on the output grid.
+    One row is written for every IMU sample that is new and is the first on the output grid.
     """
     t, settings, work, local = timeline[0], settings_[0], work_[0], locals_[0]
     rewind(states, checkpoints, t, blank)
@@ -63,7 +63,7 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
 
 @njit
 def predict(state, stamp, sample, settings, work):
-    """Bring the state to ``stamp``, at or before the IMU sample that comes next."""
+    """Propagate the state to ``stamp`` (ns), at or before the next IMU sample; restart after a long silence."""
     if state.level_known == 0:
         return
     if sample.stamp - state.imu.stamp > LONGEST_GAP:
@@ -102,9 +102,9 @@ def take_sample(state, sample):
         state.angular_rate[i] = sample.angular_rate[i]
 
 
-@njit
+@njit_in_caller
 def fuse_next(state, aids, count, settings, work):
-    """Offer the next of ``count`` measurements, signals by the epoch; return the index of the one that follows."""
+    """Fuse the next of ``count`` measurements, or all signals of its epoch; return the index of the next one."""
     i = state.aid_next
     if not is_range(aids[i].stream):
         fuse(state, aids, i, settings, work)
@@ -116,5 +116,5 @@ def fuse_next(state, aids, count, settings, work):
 
 @njit
 def is_on_grid(previous_stamp, stamp, interval):
-    """Say whether a multiple of ``interval`` (0: everything) lies in (previous_stamp, stamp]."""
+    """Say whether a multiple of ``interval`` (ns) lies in (previous_stamp, stamp]; always for the interval 0."""
     return interval == 0 or previous_stamp == NEVER or stamp // interval != previous_stamp // interval

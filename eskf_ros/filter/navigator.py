@@ -1,4 +1,4 @@
-"""The navigator: push a sensor sample, get the state. ``advance`` is the whole algorithm."""
+"""The navigator: push sensor samples, get the state. The algorithm is `loop.advance`."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ from eskf_ros.gnss.time import SECONDS_PER_WEEK, Instant
 from eskf_ros.parameters.tree import Parameters
 
 HIGHEST_ALTITUDE = 1e5
-"""What no receiver on a robot reports (m)."""
+"""m; no receiver on a robot reports more."""
 
 ORIENTATION_SHARE = SECOND // 10
-"""Of each second so much (ns) of what the IMU says of its orientation is used: a sample at least, from 10 Hz on."""
+"""ns; the IMU's own orientation is used in this part of each second: at least one sample, from 10 Hz on."""
 
 DIAGONAL = np.eye(3).ravel()
 
@@ -57,19 +57,19 @@ DIAGONAL = np.eye(3).ravel()
 NO_FIELD = (0.0, 0.0, 0.0, 0.0)
 
 NO_STAND_IN = (0.0, 0.0, 0.0)
-"""The covariance of a message is its own."""
+"""No stand-in: the covariance of a message is its own."""
 
 
 class Navigator(Readout):
     """Error-state Kalman filter over a timeline: the same for the node and for the replay.
 
-    Stamps are int64 nanoseconds on the IMU's clock. A push sorts a message into the timeline; the next ``push_imu``
-    or ``update``, or a push that finds the buffers full, does the work. See ``layout`` for the fields of rows
-    (ODOMETRY) and records (RECORD).
+    Stamps are int64 nanoseconds on the IMU's clock. A push sorts a message into the timeline; the next `push_imu` or
+    `update`, or a push that finds the buffers full, runs the filter. `output.global_odometry` describes the fields of
+    rows (ODOMETRY), `history.records` those of records (RECORD).
     """
 
     def __init__(self, parameters: Parameters, output_rate: float = 0.0) -> None:
-        """Prepare a filter; ``output_rate`` (Hz) of the rows ``push_imu`` returns, 0 for every IMU sample."""
+        """Prepare a filter; ``output_rate`` (Hz) of the rows that `push_imu` returns, 0 for every IMU sample."""
         self._output_rate = output_rate
         self._buffers = Buffers(STATE, ODOMETRY)
         self._work = allocate(WORK)
@@ -79,7 +79,7 @@ class Navigator(Readout):
         self.reset()
 
     def configure(self, parameters: Parameters) -> None:
-        """Use other parameters from now on; history within the window is judged by them when it is applied again."""
+        """Use other parameters from now on; they also apply to messages of the window that are applied again."""
         self.parameters = parameters
         self._settings = settings_from(parameters, self._output_rate)
         self._constraint_count = int(self._settings["constrains"].sum())
@@ -89,7 +89,7 @@ class Navigator(Readout):
             recall(*self._memory, parameters, self._settings[0])
 
     def reset(self) -> None:
-        """Forget everything, the datum too unless it is a parameter, and what an earlier run knew.
+        """Forget everything: the estimate, the memory of an earlier run, and the datum unless it is a parameter.
 
         Records that were not taken are lost.
         """
@@ -105,17 +105,17 @@ class Navigator(Readout):
         self._refused: list[np.ndarray] = []
         self._traffic = Traffic()
         self.range_statuses: Counter[RangeStatus] = Counter()
-        """What became of the signals before they entered the timeline: how many are usable, and why others are not."""
+        """Number of signals by status: usable, or why they never entered the timeline."""
 
     def warm_start(self, memory: Memory, age: float) -> None:
-        """Offer what an earlier run knew, ``age`` seconds ago; to be called before the first sample."""
+        """Offer the memory of an earlier run, ``age`` seconds old; to be called before the first sample."""
         self._memory = memory, age
         recall(memory, age, self.parameters, self._settings[0])
 
     def set_datum_here(self) -> bool:
         """Make the present position of the IMU the origin of the map; False while the position is unknown.
 
-        A barrier: what came before is final, and nothing older is accepted afterwards.
+        This is a barrier: what came before is final, and nothing older is accepted afterwards.
         """
         self.update()
         state = self._states[0]
@@ -127,7 +127,7 @@ class Navigator(Readout):
         return True
 
     def set_datum(self, latitude_deg: float, longitude_deg: float, altitude: float) -> None:
-        """Make a place on the ellipsoid the origin of the map, wherever the robot is. A barrier."""
+        """Make a geodetic position (deg, deg, m) the origin of the map, wherever the robot is. This is a barrier."""
         self.update()
         state, settings = self._states[0], self._settings[0]
         position, heading = tuple(state["position_map"]), heading_of(state, settings)
@@ -144,9 +144,10 @@ class Navigator(Readout):
     def set_pose(
         self, position_map: Sequence[float], position_covariance: FloatArray, heading: float, heading_std: float
     ) -> bool:
-        """Put base_link to a position in map (m, covariance (3, 3) m2) with a heading (rad); roll and pitch stay.
+        """Set base_link to a position in map (m, covariance (3, 3) m2) and a heading (rad); roll and pitch stay.
 
-        False while level or datum are unknown. A barrier.
+        ``heading`` is counter-clockwise from x of map, ``heading_std`` its standard deviation (rad). Returns False
+        while level or datum are unknown. This is a barrier.
         """
         self.update()
         state, settings = self._states[0], self._settings[0]
@@ -194,7 +195,7 @@ class Navigator(Readout):
         return parts[0] if len(parts) == 1 else np.concatenate([np.zeros(0, ODOMETRY), *parts])
 
     def update(self) -> np.ndarray:
-        """Apply what was pushed, late messages included; return rows as ``push_imu`` does."""
+        """Apply what was pushed, late messages included; return rows as `push_imu` does."""
         count = advance(
             self._states,
             self._buffers.imu,
@@ -224,9 +225,14 @@ class Navigator(Readout):
     ) -> None:
         """Take a position of the antenna: degrees, ellipsoidal metres, nine numbers East-North-Up (m2, row-major).
 
-        ``covariance_type`` and ``status`` as in NavSatFix. An unknown or all-zero covariance takes the table
+        ``covariance_type`` and ``status`` as in NavSatFix. An unknown or all-zero covariance is replaced by
         ``gnss.status_std_horizontal`` and ``_vertical``. ``frame_id`` tells which antenna it is. ``from_ranges``: it
-        was solved here from the ranges of the first receiver (``ranges.use_point_solution``).
+        was solved here from the ranges of the first receiver (``ranges.use_point_solution``). ``arrival`` (ns) goes to
+        the record.
+
+        Raises:
+            TypeError: the stamp is not an integer.
+            ValueError: the covariance has another shape.
         """
         gnss = self.parameters.gnss
         stand_in = NO_STAND_IN
@@ -259,7 +265,7 @@ class Navigator(Readout):
         """Take a velocity of the antenna relative to the Earth: East-North-Up m/s, nine numbers m2/s2 (row-major).
 
         An all-zero or absent covariance (first number negative) becomes ``gnss.unknown_velocity_std``. ``frame_id`` and
-        ``from_ranges`` as in `push_gnss_position`.
+        ``from_ranges``, and what is raised, as in `push_gnss_position`.
         """
         door = self._take(Stream.GNSS_VELOCITY, velocity_enu, covariance)
         self._push_gnss(Stream.GNSS_VELOCITY, stamp, arrival, frame_id, from_ranges, door)
@@ -274,8 +280,9 @@ class Navigator(Readout):
     ) -> None:
         """Take a measurement of any other sensor: three values with their covariance (nine numbers, row-major).
 
-        What the values are says the file of the aid in ``aiding``. An all-zero covariance takes the stand-in of the
-        parameters; an axis with a negative variance was not measured.
+        The file of the measurement in `measurements` describes the values and their units. An all-zero covariance is
+        replaced by the stand-in of the parameters; an axis with a negative variance was not measured. What is raised as
+        in `push_gnss_position`.
         """
         door = self._take(stream, values, covariance)
         self._push_aid(stream, stamp + round(self._intakes[stream].time_offset * SECOND), arrival, 0, door)
@@ -291,10 +298,14 @@ class Navigator(Readout):
     ) -> None:
         """Take the signals (MEASURED_SIGNAL, `gnss.measurements.measured_epoch`) of one epoch of the first receiver.
 
-        ``stamp``: the instant of the measurement on the IMU's clock; ``instant``: the same in GPS time, to a minute;
-        ``klobuchar``: eight parameters of the ionosphere. The signals have been measured without a position, so that
-        they do not depend on when they come. ``place``: where the epoch alone puts the antenna (deg, deg, m), as good
-        as the Earth's magnetic field needs it (``needs_field``): now and then is enough.
+        ``stamp``: the instant of the measurement on the IMU's clock (ns); ``instant``: the same in GPS time, to a
+        minute; ``klobuchar``: eight parameters of the ionosphere. The signals must not depend on the estimated
+        position, so that the result does not depend on the time of arrival. ``place``: where the epoch alone puts the
+        antenna (deg, deg, m), accurate enough for the Earth's magnetic field (`needs_field`); it may be given with some
+        epochs only.
+
+        Raises:
+            TypeError: the stamp is not an integer.
         """
         field = NO_FIELD if place is None or not self.needs_field else self._field_at(*place, stamp)
         self.range_statuses.update(status_counts(signals))
@@ -329,10 +340,10 @@ class Navigator(Readout):
             self._refused.append(refused[:count])
 
     def push_imu_orientation(self, stamps: StampArray, orientation: FloatArray, covariance: FloatArray) -> None:
-        """Take what samples of `push_imu` say of the IMU's orientation: (n, 4) x y z w and (n, 9) rad2, as in REP-145.
+        """Take the IMU's own orientation of samples of `push_imu`: (n, 4) x y z w and (n, 9) rad2, as in REP-145.
 
-        Nothing happens unless ``alignment.imu_orientation`` asks for it; then the first few of each second are enough:
-        which these are must not depend on the order in which they come.
+        Nothing happens unless ``alignment.imu_orientation`` asks for it. Then the samples at the beginning of each
+        second are used: a choice by stamp does not depend on the order of arrival.
         """
         alignment = self.parameters.alignment
         if alignment.imu_orientation == "unused":
@@ -353,23 +364,23 @@ class Navigator(Readout):
             self._push_aid(Stream.HEADING, stamp, stamp, heading.IMU_ORIENTATION, door)
 
     def take_records(self) -> np.ndarray:
-        """Return the records (RECORD) that became final since the last call: in the total order, the too late last."""
+        """Return the records (RECORD) that became final since the last call: in the total order, the late ones last."""
         return self._take_records(False)
 
     def take_live(self) -> np.ndarray:
-        """Return the records of what was judged since the last call, as they stand: a later message may change them."""
+        """Return the records of what was judged since the last call, as they stand: a late message may change them."""
         judged = self._buffers.aids[: int(self._states["aid_next"][0])]
         new = np.flatnonzero((judged["told"] == 0) & (judged["verdict"] != Verdict.INACTIVE))
         judged["told"] = 1
         return np.array([tuple(judged[name][i] for name in RECORD.names or ()) for i in new], RECORD)
 
     def finish(self) -> np.ndarray:
-        """End the data: return all remaining records, those that waited in vain for the IMU as ``waiting``."""
+        """End the data: return all remaining records; the verdict WAITING means that no IMU sample came for them."""
         self.update()
         return self._take_records(True)
 
     def _take(self, stream: Stream, values: Sequence[float], covariance: Sequence[float] | FloatArray) -> int:
-        """Fill the payload on offer, with the stand-in where no covariance came; return its door."""
+        """Fill the payload on offer, with a stand-in for a missing covariance; return its admission verdict."""
         intake = self._intakes[stream]
         matrix = nine(covariance)
         is_absent = not matrix.any() or (matrix[0] < 0.0 and not intake.may_lack_axes)
@@ -386,7 +397,7 @@ class Navigator(Readout):
         covariance: FloatArray,
         stand_in: tuple[float, float, float],
     ) -> int:
-        """Fill the payload on offer; return its door."""
+        """Fill the payload on offer; return the verdict of its admission."""
         intake = self._intakes[stream]
         scale, floor, lacks = intake.covariance_scale, intake.std_floor, intake.may_lack_axes
         door = admit(self._offered, values, covariance, stand_in, scale, floor, lacks)
@@ -403,7 +414,7 @@ class Navigator(Readout):
     def _field_at(
         self, latitude_deg: float, longitude_deg: float, altitude: float, stamp: int
     ) -> tuple[float, float, float, float]:
-        """Return the Earth's magnetic field at a fix, a function of the fix alone, as `mag.note_field` wants it."""
+        """Return the Earth's magnetic field at a fix as `mag.note_field` wants it; it depends on the fix alone."""
         declination = math.radians(self.parameters.mag.declination_deg)
         try:
             found, inclination, strength = field_at(latitude_deg, longitude_deg, altitude, stamp)
@@ -417,18 +428,18 @@ class Navigator(Readout):
         return 1.0, declination, inclination, strength
 
     def _push_gnss(self, stream: Stream, stamp: int, arrival: int, frame_id: str, from_ranges: bool, door: int) -> None:
-        """Sort the record that is on offer into the timeline, as one of the receiver with this frame."""
+        """Sort the record on offer into the timeline, as a message of the receiver with this frame."""
         second, ranges = self.parameters.second_gnss, self.parameters.ranges
         is_second = second.frame_id != "" and frame_id == second.frame_id and not from_ranges
         receiver = ranges if from_ranges else second if is_second else self.parameters.gnss
         uses_ranges = self.parameters.mode == "tight" or ranges.use_point_solution
         if uses_ranges and not is_second and not from_ranges:
-            # The fix is made of the same ranges: both together would count twice.
+            # The receiver solved this fix from the same ranges: both together would count twice.
             door = Verdict.DISABLED
         self._push_aid(stream, stamp + round(receiver.time_offset * SECOND), arrival, int(is_second), door)
 
     def _push_aid(self, stream: Stream, stamp: int, arrival: int, source: int, door: int) -> None:
-        """Sort the record that is on offer into the timeline."""
+        """Sort the record on offer into the timeline."""
         stamp = whole_stamp(stamp)
         self._traffic.offered[stream] += 1
         if door != Verdict.WAITING:
@@ -449,7 +460,7 @@ class Navigator(Readout):
         self._refused.append(np.array([record], RECORD))
 
     def _raise_barrier(self) -> None:
-        """Make what came so far final: see `timeline.raise_barrier`."""
+        """Make everything so far final: see `timeline.raise_barrier`."""
         if self._buffers.timeline["frontier"][0] != NEVER:
             records = self._take_records(True)
             self._refused.append(records)
@@ -464,12 +475,12 @@ class Navigator(Readout):
         return np.concatenate([np.array(records[:count], RECORD), *refused])
 
     def _forget(self) -> None:
-        """Drop what no message in time can reach any more."""
+        """Process what waits, and drop what no accepted message can change any more."""
         self.update()
         self._buffers.forget(self._states)
 
     def _make_room(self, aids: int = 1) -> None:
-        """See that one batch of IMU samples with its checkpoints, and so many measurements, fit into the buffers."""
+        """Make room in the buffers for one batch of IMU samples with its checkpoints, and ``aids`` measurements."""
         if not self._buffers.have_room(aids, self._constraint_count):
             self._forget()
             self._buffers.grow(aids, self._constraint_count)

@@ -1,4 +1,4 @@
-"""The prediction: state, covariance and the search for the heading from one measurement or IMU sample to the next."""
+"""Prediction: propagates state, covariance and heading search to the next measurement or IMU sample."""
 
 from __future__ import annotations
 
@@ -12,24 +12,25 @@ from eskf_ros.filter.state.time import SECOND
 from eskf_ros.geodesy.rotation import dot
 
 LONGEST_STEP = 20_000_000
-"""A longer IMU interval is integrated in equal steps of at most this many ns."""
+"""ns; a longer IMU interval is integrated in equal steps of at most this length."""
 
 WANDER_ACCELERATION = 0.5
+"""m/s2; acceleration of the robot beyond the measured one that is assumed with an unknown heading (process noise)."""
 
 WANDER_TIME = 1.0
-"""Unknown heading: the robot may accelerate by this much (m/s2) more than measured, for about this long (s)."""
+"""s; correlation time of the unknown acceleration with an unknown heading."""
 
 
 @njit
 def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
-    """Advance nominal state and covariance by ``dt`` s between two raw IMU readings (m/s2, rad/s; IMU axes).
+    """Propagate nominal state and covariance by ``dt`` s between two raw IMU readings (m/s2, rad/s; IMU axes).
 
     ``gap`` (s) is the length of the hole in the IMU data that is being bridged, 0 for none.
     """
-    # With an unknown heading the direction of the measured acceleration is unknown: position and velocity live on GNSS.
+    # With an unknown heading the direction of the measured acceleration on the map is unknown: it is not integrated.
     coupling = 0.0 if state.heading_known == 0 else 1.0
     middle, force, gravity = propagate_nominal_state(state, force_0, rate_0, force_1, rate_1, dt, coupling)
-    # Motion hidden by a gap is constant over it: as a density it has the same variance at the end.
+    # Motion hidden by a gap is assumed to be constant; this density gives the same variance at its end.
     velocity_noise = settings.accel_noise_density**2 + settings.gap_accel_std**2 * gap
     attitude_noise = settings.gyro_noise_density**2 + settings.gap_gyro_std**2 * gap
     if state.heading_known == 0:
@@ -45,11 +46,11 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
 
 @njit
 def propagate(state, stamp, sample, settings, work):
-    """Advance the state to ``stamp`` (ns), at or before ``sample``, the IMU sample that comes next.
+    """Propagate the state to ``stamp`` (ns), at or before ``sample``, the next IMU sample.
 
     Between two samples the IMU is the straight line whose mean is that of the parabola through them and the sample
-    before (Adams-Moulton): cut anywhere, the parts give the whole. A long interval is integrated in steps; one longer
-    than the gap of the settings may hide motion and costs extra uncertainty.
+    before (Adams-Moulton): an interval gives the same result wherever it is cut. A long interval is integrated in
+    steps; one longer than the gap of the settings may hide motion and adds process noise.
     """
     interval = (sample.stamp - state.imu.stamp) / SECOND
     force_0, force_1 = line(state.imu.earlier_force, state.imu.force, sample.specific_force, interval, state, settings)
@@ -77,7 +78,7 @@ def propagate(state, stamp, sample, settings, work):
 
 @njit
 def line(earlier, last, following, interval, state, settings):
-    """Return the ends of the straight line that stands for the IMU between two samples (see ``propagate``)."""
+    """Return the ends of the straight line that stands for the IMU between two samples (see `propagate`)."""
     bend = 0.0
     if interval <= settings.imu_gap and 0.0 < state.imu.interval <= settings.imu_gap:
         bend = interval * interval / (6.0 * (interval + state.imu.interval))

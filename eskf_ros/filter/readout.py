@@ -1,4 +1,4 @@
-"""What can be read of a filter: the estimate, its status, counts, and what is wrong. Nothing here changes it."""
+"""Readout of a filter: the estimate, its status, counts and warnings. Nothing here changes the filter."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from eskf_ros.geodesy.rotation import to_matrix
 
 
 class Readout:
-    """The readable side of a `Navigator`, which owns what is read here."""
+    """The readable side of a `Navigator`, which owns the data."""
 
     _states: np.ndarray
     _settings: np.ndarray
@@ -47,12 +47,12 @@ class Readout:
 
     @property
     def status(self) -> Status:
-        """The rung of the start-up ladder at the newest IMU sample."""
+        """The `Status` at the newest IMU sample."""
         return Status(status_of(self._states[0], self._settings[0]))
 
     @property
     def memory(self) -> Memory | None:
-        """What the next start wants to know (see `warm_start`); None while position or heading are unknown."""
+        """What the next run needs for a warm start (`warm_start`); None while position or heading are unknown."""
         state, row = self._states[0], self.odometry[0]
         if row["status"] not in (Status.ALIGNING, Status.GOOD, Status.COASTING, Status.DEGRADED):
             return None
@@ -88,7 +88,7 @@ class Readout:
 
     @property
     def clock(self) -> tuple[float, float] | None:
-        """Bias (m) and drift (m/s) of the receiver's clock; None while ranges have not told both."""
+        """Bias (m) and drift (m/s) of the receiver clock; None until ranges have determined both."""
         state, place = self._states[0], int(self._settings["clock_at"][0])
         if place >= state["error_size"] or not state["tight"]["clock_known"].all():
             return None
@@ -97,9 +97,9 @@ class Readout:
 
     @property
     def inter_system_offsets(self) -> dict[int, float]:
-        """By what the ranges of a constellation (`gnss.signals.time_group`) are longer than those of GPS (m).
+        """Offset of the ranges of a constellation (`gnss.signals.time_group`) from those of GPS (m).
 
-        Those of which no signal came are not there.
+        Constellations without a signal are absent.
         """
         state, first = self._states[0], int(self._settings["inter_system_at"][0])
         offsets = state["optional"][first - ERROR_SIZE : max(first, int(state["error_size"])) - ERROR_SIZE].tolist()
@@ -115,12 +115,12 @@ class Readout:
 
     @property
     def clock_jumps(self) -> int:
-        """Milliseconds by which the receiver's clock has jumped, to either side."""
+        """Milliseconds by which the receiver clock has jumped, the jumps of either sign added up."""
         return int(self._states["tight"]["clock_jumps"][0])
 
     @property
     def range_faults(self) -> int:
-        """How often most satellites contradicted the estimate, which was then given the uncertainty they show."""
+        """How often most satellites contradicted the estimate, whose variance was then inflated."""
         return int(self._states["tight"]["range_faults"][0])
 
     @property
@@ -131,44 +131,44 @@ class Readout:
 
     @property
     def waiting(self) -> int:
-        """How many measurements wait for the IMU samples of their time."""
+        """Number of measurements that wait for IMU samples of their time."""
         return int(self._buffers.timeline["aid_count"][0] - self._states["aid_next"][0])
 
     @property
     def window_needed(self) -> float:
-        """The window (s) that would have kept every message so far; 0 when none was too late."""
+        """The history window (s) that would have accepted every message so far; 0 if none was too late."""
         return float(self._buffers.timeline["furthest_late"][0]) / SECOND
 
     @property
     def restarts(self) -> int:
-        """How often the alignment started again: after a long silence of the IMU, or many rejected fixes in a row."""
+        """Number of restarts of the alignment: after a long silence of the IMU, or many rejected fixes in a row."""
         return int(self._states["restarts"][0])
 
     @property
     def position_resets(self) -> int:
-        """How often fixes that agree with each other won over the filter: position and velocity were reset to them."""
+        """How often rejected fixes that agree with each other won over the filter: position and velocity were reset."""
         return int(self._states["recovery"]["resets"][0])
 
     def phase(self, stream: Stream, source: int = 0) -> Phase:
-        """Return what an aid is to the filter at the moment; ``source``: which receiver."""
+        """Return whether the filter uses a stream at present; ``source``: which receiver."""
         return Phase(phase_of(self._states[0], int(stream), source))
 
     @property
     def complaints(self) -> list[str]:
-        """What is wrong with whole streams, one sentence each with what to do; empty when nothing is."""
+        """One sentence for each fault of a stream, with what to do; empty without faults."""
         state = self._states[0]
         found = complaints(state)
-        # With a wrong heading the fixes seem to be wrong in many ways, which then mean nothing.
+        # A wrong heading makes the fixes look faulty: warnings about the receivers would mislead.
         if not is_heading_contradicted(state):
             found += aid_complaints(state, self._settings[0])
         return found + self._traffic.complaints()
 
     @property
     def notes(self) -> list[str]:
-        """What is worth knowing of the streams though nothing is wrong: one sentence each."""
+        """One sentence for each fact worth knowing of the streams though nothing is wrong."""
         return self._traffic.notes()
 
     @property
     def held_bytes(self) -> int:
-        """Memory of the history buffers: grows with window and rates, not with time."""
+        """Memory of the history buffers (bytes): grows with window and rates, not with time."""
         return self._buffers.held_bytes

@@ -1,4 +1,4 @@
-"""The parameters as the estimator uses them: what the kernels read, and how the messages are taken in."""
+"""The parameters as the estimator uses them: the settings of the kernels, and the intakes of the messages."""
 
 from __future__ import annotations
 
@@ -19,11 +19,13 @@ from eskf_ros.geodesy.earth import east_north_up_to_ecef, geodetic_to_ecef
 from eskf_ros.parameters.tree import Parameters
 
 SWITCHED_ON_SHARE = 0.1
-"""Switching off and on, and another temperature, move a bias by this share of its standard deviation at start."""
+"""Share of its initial standard deviation by which a bias changes when the IMU is switched off and on, at another
+temperature.
+"""
 
 
 def intakes_from(parameters: Parameters) -> dict[Stream, Intake]:
-    """Return how the messages of the streams are taken in, but for ranges: `Navigator.push_ranges` does that itself."""
+    """Return the `Intake` of each stream; ranges have none, `Navigator.push_ranges` checks them itself."""
     intakes = {}
     for row in ROWS:
         if row.limits is not None:
@@ -47,7 +49,10 @@ def gate_probability(row: Row, parameters: Parameters) -> float:
 
 
 def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarray:
-    """Return the parameters as the kernels use them (SETTINGS): radians, lever arms from the IMU in its axes."""
+    """Return the parameters as the kernels use them (SETTINGS): radians, lever arms from the IMU in its axes.
+
+    ``output_rate`` in Hz; 0: a row for every IMU sample.
+    """
     settings = allocate(SETTINGS)
     imu, alignment = parameters.imu, parameters.alignment
     for name in (
@@ -79,7 +84,7 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
         if row.settings.names:
             row.describe(settings[row.name][0], parameters)
     settings["gnss_covariance_scale"] = parameters.gnss.covariance_scale
-    # In mode tight what lasts is in the ranges, and no fix knows of it.
+    # In mode tight the correlated error belongs to the ranges, not to fixes.
     settings["correlated_share"] = parameters.gnss.correlated_share if parameters.mode == "loose" else 0.0
     place_optional_states(settings[0], parameters)
     settings["static_duration"] = alignment.static_duration
@@ -99,9 +104,9 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
 
 
 def place_optional_states(settings: np.void, parameters: Parameters) -> None:
-    """Give the optional states that are switched on their places and their models, and the streams their reach.
+    """Assign the active augmented states their indices and models, and the streams the errors that they need.
 
-    The offsets of the constellations join one by one, with the first signal of each (`ranges`).
+    The offsets of the constellations are activated one by one, with the first signal of each (`receiver_clock`).
     """
     settings["reach"] = end = ERROR_SIZE
     for block in optional_blocks(parameters):
@@ -119,13 +124,13 @@ def place_optional_states(settings: np.void, parameters: Parameters) -> None:
 
 
 def optional_blocks(parameters: Parameters) -> tuple[OptionalBlock, ...]:
-    """Return the augmented states in the order of their places."""
+    """Return the augmented states in the order of their indices."""
     blocks = [block for row in ROWS for block in row.augmented(parameters)]
     return tuple(sorted(blocks, key=lambda block: list(OPTIONAL_SIZES).index(block.name)))
 
 
 def recall(memory: Memory, age: float, parameters: Parameters, settings: np.ndarray) -> None:
-    """Write a memory ``age`` seconds old into the settings (SETTINGS), with the uncertainty it has by now."""
+    """Write a memory that is ``age`` seconds old to the settings (SETTINGS), with its present uncertainty."""
     imu, warm = parameters.imu, parameters.warm_start
     for name, at_start, walk in (
         ("accel_bias", imu.accel_bias_std, imu.accel_bias_random_walk),

@@ -1,1 +1,1 @@
-"""The Earth: what node, replay and simulator alike need to know of the map frame on it."""
+"""The Earth: geodesy, gravity, magnetic field, rotations; shared by filter, node, replay and simulator."""

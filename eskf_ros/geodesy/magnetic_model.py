@@ -1,8 +1,8 @@
 """The Earth's magnetic field by the World Magnetic Model, through the library pygeomag, which need not be installed.
 
-The field changes so little from place to place and from year to year that it is computed once for each cell of
-`PLACE_STEP_DEG`, `ALTITUDE_STEP` and `TIME_STEP`, at the middle of the cell: what comes out is a function of place and
-time alone, whatever was asked before.
+The field changes little from place to place and from year to year. It is computed once for each cell of
+`PLACE_STEP_DEG`, `ALTITUDE_STEP` and `TIME_STEP`, at the middle of the cell: the result is a function of place and time
+alone, whatever was asked before.
 """
 
 from __future__ import annotations
@@ -15,22 +15,31 @@ Field = tuple[float, float, float]
 """Declination (rad, east of true north positive), inclination (rad, below the horizon positive), strength (T)."""
 
 PLACE_STEP_DEG = 0.1
+"""deg; size of a cell in latitude and longitude. With the other steps it leaves an error of a few hundredths of a
+degree where the declination changes fast.
+"""
+
 ALTITUDE_STEP = 1000.0
+"""m; size of a cell in altitude."""
+
 TIME_STEP = 0.1
-"""Where the declination changes fast, this leaves a few hundredths of a degree (deg, m, years)."""
+"""years; size of a cell in time."""
 
 FIRST_YEAR, LAST_YEAR = 2010, 2029
-"""The years of the coefficients that the library brings; three more on either side are extrapolated."""
+"""First and last year of the coefficients in the library; three more years on either side are extrapolated."""
 
 SECONDS_PER_YEAR = 31_556_952.0
 
 
 class FieldUnknown(Exception):
-    """The model cannot tell the field; the message is a sentence that says why and what to do."""
+    """The model does not know the field; the message is a sentence that says why and what to do."""
 
 
 def field_at(latitude_deg: float, longitude_deg: float, altitude: float, stamp: int) -> Field:
-    """Return the field at a place (ellipsoidal altitude in m) at ``stamp`` (ns since 1970). Raises FieldUnknown."""
+    """Return the field at a place (deg, deg, ellipsoidal altitude in m) and ``stamp`` (ns since 1970).
+
+    Raises FieldUnknown without the library, or for a year without a model.
+    """
     year = 1970.0 + stamp * 1e-9 / SECONDS_PER_YEAR
     return _field_of_cell(
         math.floor(latitude_deg / PLACE_STEP_DEG),

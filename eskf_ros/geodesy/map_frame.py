@@ -1,4 +1,4 @@
-"""Where ``map`` lies on the Earth, for whole arrays of positions."""
+"""The map frame on the Earth, for whole arrays of positions."""
 
 from __future__ import annotations
 

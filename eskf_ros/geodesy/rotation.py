@@ -150,5 +150,5 @@ def left_jacobian(v):
 
 @njit
 def wrapped(angle):
-    """Return ``angle`` (rad) brought within half a turn of zero."""
+    """Return ``angle`` (rad) wrapped to [-pi, pi)."""
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))

@@ -15,11 +15,13 @@ from eskf_ros.gnss.signals import L1, SPEED_OF_LIGHT
 from eskf_ros.gnss.time import SECONDS_PER_DAY
 
 LOWEST_ALTITUDE = -1000.0
+"""m; lowest altitude at which the troposphere is evaluated; lower ones get its value."""
+
 HIGHEST_ALTITUDE = 30e3
-"""The troposphere is evaluated between these altitudes (m); what is beyond gets their values."""
+"""m; highest altitude at which the troposphere is evaluated; higher ones get its value."""
 
 LOWEST_ELEVATION = math.radians(3.0)
-"""Below, the delay is that of this elevation: no mapping function holds there."""
+"""rad; lower elevations get the delay of this one, because no mapping function holds there."""
 
 # RTCA DO-229E, A.4.2.4, parameters of the troposphere: pressure (hPa), temperature (K), vapour pressure (hPa), lapse
 # of temperature (K/m) and of vapour at sea level, yearly mean and amplitude, at latitudes 15, 30, 45, 60, 75 deg.
@@ -83,11 +85,12 @@ _FIRST_DAY_OF_YEAR = 6.0
 def klobuchar(parameters, seconds, latitude, longitude, elevation, azimuth):
     """Return the ionospheric delay (m) at 1575.42 MHz; another carrier has (1575.42 MHz / carrier)^2 of it.
 
-    ``parameters``: eight numbers, alpha 0 to 3 and beta 0 to 3 of GPS (or QZSS); ``seconds`` of GPS week. IS-GPS-200N,
-    section 20.3.3.5.2.5; it leaves about half of the ionosphere. NaN parameters give NaN.
+    ``parameters``: eight numbers, alpha 0 to 3 and beta 0 to 3 of GPS (or QZSS); ``seconds`` of GPS week; place and
+    direction in rad. IS-GPS-200N, section 20.3.3.5.2.5; the model leaves about half of the delay uncorrected. NaN
+    parameters give NaN.
     """
     elevation = max(0.0, elevation)
-    # Semicircles, as the parameters are.
+    # In semicircles, like the parameters.
     central_angle = 0.0137 / (elevation / math.pi + 0.11) - 0.022
     pierce_latitude = latitude / math.pi + central_angle * math.cos(azimuth)
     pierce_latitude = min(0.416, max(-0.416, pierce_latitude))
@@ -114,7 +117,7 @@ def klobuchar(parameters, seconds, latitude, longitude, elevation, azimuth):
 
 @njit
 def ionosphere_scale(carrier_hz):
-    """Return by what the delay at 1575.42 MHz is to be multiplied for another carrier (IS-GPS-200N, 20.3.3.3.3.2)."""
+    """Return the factor from the delay at 1575.42 MHz to that of another carrier (IS-GPS-200N, 20.3.3.3.3.2)."""
     return (L1 / carrier_hz) ** 2
 
 
@@ -173,7 +176,7 @@ def niell(week, seconds, latitude, altitude, elevation):
 
 @njit
 def season_and_place(week, seconds, latitude):
-    """Return the cosine of the season (1 on the coldest day) and where a latitude lies in the tables (row, part)."""
+    """Return the cosine of the season (1 on the coldest day) and the place of a latitude in the tables (row, part)."""
     # Days since 1 January 1980 have the phase of the year within a day for a century.
     day = week * 7.0 + seconds / SECONDS_PER_DAY + _FIRST_DAY_OF_YEAR
     if latitude < 0.0:

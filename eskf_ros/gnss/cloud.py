@@ -2,7 +2,7 @@
 
 Knows the layout of the message but no ROS: a cloud is its list of fields and its bytes, seen as a structured array with
 the fields of the sender (`points`). Node, replay and simulator share it. The fields are found by name; their order,
-padding, byte order and number types are the sender's, and names that mean nothing here are ignored.
+padding, byte order and number types are those of the sender, and unknown names are ignored.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from eskf_ros.gnss.signals import GNSS_COUNT, SIGNAL_BY_UBLOX, SIGNALS, UNKNOWN_
 from eskf_ros.gnss.time import SECONDS_PER_WEEK
 
 MAX_SIGNALS = 200
-"""Signals of an epoch that are read; the sky has fewer, a lidar has more."""
+"""Signals of an epoch that are read, at most; the sky has fewer, a cloud with more is probably that of a lidar."""
 
 REQUIRED = ("gnss_id", "sv_id", "gps_week", "gps_tow", "pseudorange")
 
 NUMBER_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-"""numpy code of the constants of sensor_msgs/PointField."""
+"""numpy codes of the constants of sensor_msgs/PointField."""
 
 _DATATYPES = {code: datatype for datatype, code in NUMBER_TYPES.items()}
 
 
 class CloudError(ValueError):
-    """A cloud is not what its topic needs. Its text is one line for the user."""
+    """A cloud does not have what its topic needs. The text is one line for the user."""
 
 
 class PointField(NamedTuple):
-    """As sensor_msgs/PointField, where ``length`` is called count; 0, which some senders leave, means 1."""
+    """A field as in sensor_msgs/PointField, whose count is ``length`` here; 0, which some senders leave, means 1."""
 
     name: str
     offset: int
@@ -53,7 +53,7 @@ class PointField(NamedTuple):
 
 @lru_cache(maxsize=64)
 def point_dtype(fields: tuple[PointField, ...], point_step: int, big_endian: bool) -> np.dtype[Any]:
-    """Return the structured dtype of a point. Raises CloudError for fields that cannot be."""
+    """Return the structured dtype of a point. Raises CloudError for impossible fields."""
     order = ">" if big_endian else "<"
     names, formats, offsets = [], [], []
     for field in fields:
@@ -83,7 +83,7 @@ def points(
 ) -> NDArray[Any]:
     """Return the points (height x width,) of a cloud as a view of ``data`` (bytes).
 
-    Raises CloudError when the fields or the amount of data do not fit.
+    Raises CloudError if the fields or the amount of data do not fit.
     """
     dtype = point_dtype(tuple(fields), point_step, big_endian)
     row = row_step if height > 1 else width * point_step
@@ -100,7 +100,7 @@ def points(
 
 
 def points_of(message: Any) -> NDArray[Any]:
-    """Return the points of a sensor_msgs/PointCloud2 as a ROS client library gives it. Raises CloudError."""
+    """Return the points of a sensor_msgs/PointCloud2 object of a ROS client library. Raises CloudError."""
     fields = [PointField(field.name, field.offset, field.datatype, field.count) for field in message.fields]
     data, height, width = message.data, message.height, message.width
     return points(fields, data, height, width, message.point_step, message.row_step, bool(message.is_bigendian))
@@ -116,7 +116,7 @@ def fields_of(dtype: np.dtype[Any]) -> list[PointField]:
 
 
 def number_column(found: NDArray[Any], name: str, missing: float = math.nan) -> NDArray[np.float64]:
-    """Return a field of points as float64, ``missing`` where there is no such field. Raises CloudError for a list."""
+    """Return a field of points as float64, or ``missing`` without such a field. Raises CloudError for a list."""
     if name not in (found.dtype.names or ()):
         return np.full(len(found), missing)
     if found.dtype[name].shape:
@@ -125,7 +125,7 @@ def number_column(found: NDArray[Any], name: str, missing: float = math.nan) -> 
 
 
 def whole_column(found: NDArray[Any], name: str, missing: int) -> NDArray[np.int64]:
-    """Return a field of points as integers; what is none, or larger than 32 bits, becomes -1."""
+    """Return a field of points as integers; -1 for what is no integer or has more than 32 bits."""
     if name in (found.dtype.names or ()) and found.dtype[name].str[1:] in ("u1", "u2", "i2"):
         return np.asarray(found[name]).astype(np.int64)
     numbers = number_column(found, name, missing)
@@ -143,10 +143,10 @@ def require(found: NDArray[Any], names: Sequence[str]) -> None:
 
 @dataclass
 class Epoch:
-    """What a receiver measured at one instant.
+    """The measurements of a receiver at one instant.
 
-    ``week``, ``seconds``: GPS time by its own clock (seconds NaN when no time tag is a time). ``ranges``: RANGE, not
-    located, those that cannot be used with their status. ``left_out``: points beyond `MAX_SIGNALS`, which are not read.
+    ``week``, ``seconds``: GPS time by its own clock (seconds NaN if no time tag is a time). ``ranges``: RANGE, not
+    located; unusable ones with their status. ``left_out``: points beyond `MAX_SIGNALS`, which are not read.
     """
 
     week: int
@@ -156,9 +156,10 @@ class Epoch:
 
 
 def read_epoch(found: NDArray[Any]) -> Epoch:
-    """Return the epoch in the points of a cloud. Raises CloudError when a required field is missing, naming it.
+    """Return the epoch in the points of a cloud. Raises CloudError if a required field is missing, naming it.
 
-    Ranges whose time tag is not that of most of the others get the status WRONG_TIME: they are of another epoch.
+    Ranges whose time tag differs from that of most of the others get the status WRONG_TIME: they belong to another
+    epoch.
     """
     require(found, REQUIRED)
     left_out = max(0, len(found) - MAX_SIGNALS)
@@ -204,15 +205,17 @@ _PLAIN = [
 ]
 _SATELLITE = [(f"sat_{name}", "<f8") for name in ("x", "y", "z", "vx", "vy", "vz", "clk", "clk_drift")]
 PLAIN_POINT = np.dtype(_PLAIN)
+"""Points of 54 bytes that `write_epoch` makes without satellites."""
+
 SATELLITE_POINT = np.dtype(_PLAIN + _SATELLITE)
-"""What `write_epoch` makes: points of 54 bytes, with satellites 118."""
+"""Points of 118 bytes that `write_epoch` makes with satellites."""
 
 
 def write_epoch(ranges: NDArray[np.void], week: int, seconds: float, satellites: bool = False) -> NDArray[Any]:
     """Return the points of ranges (RANGE) with one time tag: PLAIN_POINT, or SATELLITE_POINT with ``satellites``.
 
-    With ``satellites`` those that the ranges know (`SATELLITE_KNOWN`) are written too. A signal for which u-blox has no
-    number (P(Y) codes) cannot be written and is left out.
+    With ``satellites`` the known satellite states (`SATELLITE_KNOWN`) are written, too. A signal for which u-blox has
+    no number (P(Y) codes) cannot be written and is left out.
     """
     known = ranges["signal"] < len(SIGNALS)
     number = np.where(known, UBLOX_NUMBER[np.where(known, ranges["signal"], 0)], -1)
@@ -256,7 +259,7 @@ def _time_tag(weeks: NDArray[np.int64], seconds: NDArray[np.float64]) -> tuple[i
 
 
 def _signals(gnss_id: NDArray[np.int32], carrier_hz: NDArray[np.float64], found: NDArray[Any]) -> NDArray[np.int64]:
-    """Return the signal of each point: by ``sig_id``, without that field by the carrier, else the first there is."""
+    """Return the signal of each point: by ``sig_id``, without that field by the carrier, else the default signal."""
     known = (gnss_id >= 0) & (gnss_id < GNSS_COUNT)
     row = np.where(known, gnss_id, GNSS_COUNT)
     if "sig_id" in (found.dtype.names or ()):

@@ -1,4 +1,4 @@
-"""Ephemerides that come one by one while the robot drives, and which of them an epoch of ranges may use."""
+"""Ephemerides that arrive one by one while the robot drives, and which of them serve an epoch of ranges."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from eskf_ros.gnss.ephemeris import EPHEMERIS, Ephemerides
 from eskf_ros.gnss.time import Instant, elapsed, normalized
 
 LARGEST_LEAD = 10_000_000_000
-"""A message stamped this far (ns) ahead of the ranges has another clock: its stamp is not believed."""
+"""ns; a message stamped this far ahead of the ranges has another clock: its stamp is not believed."""
 
 PRUNE_INTERVAL = 900.0
-"""s from one look for ephemerides whose time has ended to the next."""
+"""s; time from one search for outdated ephemerides to the next."""
 
 
 class _Message(NamedTuple):
-    """What one message brought. Compared as a whole, so that the order of arrival leaves no trace."""
+    """Content of one message. Compared as a whole, so that the order of arrival has no influence."""
 
     stamp: int
     klobuchar: bytes
@@ -27,18 +27,18 @@ class _Message(NamedTuple):
 
 
 class DatedEphemerides:
-    """The ephemerides known at the stamp of an epoch: the same in whatever order messages and epochs arrive.
+    """The ephemerides that serve an epoch: independent of the order in which messages and epochs arrive.
 
-    A message serves the epochs that are later than its own stamp by the ``window`` (ns) of the history: those that are
-    in time find all the messages that are in time. Nothing is lost by the wait, since an issue is sent long before
-    the one it replaces grows old. What has no stamp, or one that cannot be true, serves at once.
+    A message serves the epochs that are later than its stamp by the ``window`` (ns) of the history or more: an epoch in
+    time thus finds all messages that arrive in time. The delay costs nothing, because an issue is sent long before the
+    one it replaces is outdated. A message without a stamp, or with an impossible one, serves at once.
 
-    Messages that bring what is known already cost nothing, and what no epoch can use any more is forgotten, so that a
-    node may run for ever. Files are kept as they are.
+    Messages that bring nothing new take no memory, and ephemerides that no epoch can use any more are forgotten, so
+    that a node may run for ever. Those of files are kept.
     """
 
     def __init__(self, records: NDArray[np.void], klobuchar: NDArray[np.float64], window: int) -> None:
-        """Start with the records (EPHEMERIS) of files and eight parameters of the ionosphere, good for any stamp."""
+        """Start with the records (EPHEMERIS) of files and eight parameters of the ionosphere, which serve any stamp."""
         self._window = window
         self._files = records
         self._settled = Ephemerides(records)
@@ -51,8 +51,8 @@ class DatedEphemerides:
         self._pruned: Instant = 0, 0.0
 
     def add(self, stamp: int, records: NDArray[np.void], klobuchar: NDArray[np.float64] | None) -> None:
-        """Take what a message stamped so (ns) brought: records (EPHEMERIS), parameters of the ionosphere if any."""
-        # What is settled serves every epoch still to come, whether it is sent again or not.
+        """Add the content of a message with this stamp (ns): records (EPHEMERIS), ionosphere parameters if any."""
+        # Settled records serve every epoch still to come: a repetition adds nothing.
         fresh = self._settled.unknown(records)
         if len(fresh) or klobuchar is not None:
             insort(self._messages, _Message(stamp, b"" if klobuchar is None else klobuchar.tobytes(), fresh.tobytes()))
@@ -62,10 +62,10 @@ class DatedEphemerides:
 
         ``instant``: GPS time of the epoch; without it nothing is forgotten.
         """
-        # The earlier of two epochs in a row: a single one with a wrong stamp settles nothing.
+        # The earlier of two epochs in a row decides, so that a single wrong stamp settles nothing.
         self._newest = max(self._newest, min(self._previous or stamp, stamp))
         self._previous = stamp
-        # All that serves every epoch still to come becomes one.
+        # Messages that serve every epoch still to come are merged.
         settled = self._older_than(self._newest - 2 * self._window)
         if settled:
             self._settled, self._settled_klobuchar = self._with(self._messages[:settled])
@@ -80,9 +80,9 @@ class DatedEphemerides:
         return self._joined
 
     def _prune(self, instant: Instant) -> None:
-        """Forget what ended before the epochs still to come, now and then.
+        """Forget from time to time what is outdated for all epochs still to come.
 
-        By the earlier of two epochs in a row: a single one with a wrong time tag forgets nothing.
+        The earlier of two epochs in a row decides, so that a single wrong time tag has no effect.
         """
         week, seconds = min(self._instant, instant)
         self._instant = instant
@@ -93,11 +93,11 @@ class DatedEphemerides:
             self._settled.add(self._files)
 
     def _older_than(self, stamp: int) -> int:
-        """How many messages have this stamp or an earlier one."""
+        """Return the number of messages with this stamp (ns) or an earlier one."""
         return bisect_right(self._messages, stamp, key=lambda message: message.stamp)
 
     def _with(self, messages: list[_Message]) -> tuple[Ephemerides, NDArray[np.float64]]:
-        """Add messages to what is settled; of several parameters of the ionosphere the last are in force."""
+        """Return the settled ephemerides with those of messages, and the last ionosphere parameters among them."""
         records = self._settled.unknown(np.frombuffer(b"".join(message.records for message in messages), EPHEMERIS))
         klobuchar = self._settled_klobuchar
         for message in messages:

@@ -1,9 +1,9 @@
-"""Broadcast ephemerides: one record per satellite and issue, checked, sorted, each once.
+"""Broadcast ephemerides: one record per satellite and issue, checked, sorted, without duplicates.
 
-`kepler_record` and `glonass_record` take the numbers of a navigation message in RINEX units (rad, m, s; km for GLONASS)
-by name, whatever file or topic brought them. What depends on the message is settled there: times become GPS time, group
-delays and health become tables indexed by the slot of a signal (`eskf_ros.gnss.signals`), so that the kernels need no
-knowledge of messages.
+`kepler_record` and `glonass_record` take the numbers of a navigation message by name, in RINEX units (rad, m, s; km for
+GLONASS), from any file or topic. All that depends on the kind of message is resolved there: times become GPS time,
+group delays and health become tables indexed by the slot of a signal (`eskf_ros.gnss.signals`), so that the kernels
+need no knowledge of messages.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from eskf_ros.gnss.time import (
 
 
 class Message(IntEnum):
-    """Navigation message (names of RINEX 4). Of several that serve a signal the lowest number is used."""
+    """Navigation message (names of RINEX 4). Of several that serve a signal the one with the lowest number is used."""
 
     LNAV = 0
     INAV = 1
@@ -53,7 +53,7 @@ class Fault(IntEnum):
 
 
 NO_ISSUE = -1
-"""The issue of a message that has none (CNAV), and the request for any issue."""
+"""Issue of a message that has none (CNAV), and the request for any issue."""
 
 KEPLER_FIELDS = (
     "sqrt_a",
@@ -89,7 +89,7 @@ EPHEMERIS = np.dtype(
         ("toc_week", "i4"),
         ("sent_week", "i4"),
         ("channel", "i4"),
-        # Eight bytes leave no gap, whose content would be anything: records are told apart by their bytes.
+        # Eight bytes, because a gap would have arbitrary content and records are compared by their bytes.
         ("unhealthy", "i8"),
         ("toe", "f8"),
         ("toc", "f8"),
@@ -108,14 +108,17 @@ EPHEMERIS = np.dtype(
 )
 """One broadcast ephemeris.
 
-``issue``: IODE, IODnav or AODE; for GLONASS the number of the quarter of an hour in the Moscow day. ``toe``, ``toc``,
-``sent``: seconds of GPS week of ephemeris, clock and transmission (NaN unknown), with their weeks. ``toe_own``:
-seconds of week of ``toe`` in the constellation's own time, as the longitude of the node needs it. ``max_lead``,
-``max_age``: seconds before and after ``toe`` for which the orbit is good. ``accuracy``: URA or SISA, m (NaN unknown).
-``af0``, ``af1``, ``af2``: clock polynomial from ``toc`` (s, s/s, s/s2), for GLONASS -TauN and GammaN. ``position``,
-``velocity``, ``acceleration``: GLONASS state at ``toe`` in PZ-90.11 (m, m/s, m/s2, the acceleration by Sun and Moon).
-``channel``: GLONASS frequency channel. ``group_delay``: seconds by which a signal leaves later than the clock
-polynomial says, NaN where the message does not tell. ``unhealthy``: bit per slot.
+- ``issue``: IODE, IODnav or AODE; for GLONASS the number of the quarter of an hour in the Moscow day.
+- ``toe``, ``toc``, ``sent``: seconds of GPS week of ephemeris, clock and transmission (NaN unknown), with their weeks.
+- ``toe_own``: seconds of week of ``toe`` in the constellation's own time, as the longitude of the node needs it.
+- ``max_lead``, ``max_age``: seconds before and after ``toe`` for which the orbit is good.
+- ``accuracy``: URA or SISA, m (NaN unknown).
+- ``af0``, ``af1``, ``af2``: clock polynomial from ``toc`` (s, s/s, s/s2), for GLONASS -TauN and GammaN.
+- ``position``, ``velocity``, ``acceleration``: GLONASS state at ``toe`` in PZ-90.11 (m, m/s, m/s2, the acceleration by
+  Sun and Moon); ``channel``: GLONASS frequency channel.
+- ``group_delay``: seconds by which a signal leaves later than the clock polynomial says, NaN if the message does not
+  tell.
+- ``unhealthy``: bit per slot.
 """
 
 SATELLITE_KEYS = 256
@@ -123,10 +126,10 @@ SATELLITE_KEYS = 256
 
 ALL_SLOTS = (1 << SLOT_COUNT) - 1
 
-# How long an ephemeris is used (s): before its reference time and after. GPS: half the usual fit interval to both sides
-# (IS-GPS-200N, section 20.3.3.4.3.1); Galileo and BeiDou are fitted to the hours that follow. At the limits the orbits
-# of a day were 2 to 9 m (95 %) off precise orbits and off the ephemerides in force; an hour later Galileo's are 10 m,
-# GLONASS's 100 m off.
+# Time (s) for which an ephemeris is used before and after its reference time. GPS: half the usual fit interval to both
+# sides (IS-GPS-200N, section 20.3.3.4.3.1); Galileo and BeiDou are fitted to the hours that follow. Over one day, the
+# errors at these limits were 2 to 9 m (95 %) against precise orbits and against the ephemerides in force; an hour later
+# they are 10 m for Galileo and 100 m for GLONASS.
 _LEAD_AND_AGE = {
     Gnss.GPS: (7200.0, 7200.0),
     Gnss.QZSS: (5400.0, 5400.0),
@@ -136,7 +139,7 @@ _LEAD_AND_AGE = {
 }
 
 _NOT_BROADCAST = 9.9e8
-"""RINEX 3.05 and 4 write .999999999999E+09 and 9.999E+09 for a parameter that is not broadcast."""
+"""Smallest value that means "not broadcast": RINEX 3.05 and 4 write .999999999999E+09 or 9.999E+09."""
 
 _GAMMA_L2 = (L1 / L2) ** 2
 _GAMMA_E5A = (L1 / L5) ** 2
@@ -146,11 +149,11 @@ Fields = Mapping[str, float]
 
 
 class Broadcast(NamedTuple):
-    """A navigation message as it was sent, from which a record is made.
+    """A navigation message as it was sent; a record is made from it.
 
     ``week``, ``seconds``: reference time of the clock (GLONASS: tb in UTC) on the constellation's own time scale, the
     week counted from 6 January 1980. ``fields``: the other numbers by the names of `kepler_record` or `glonass_record`,
-    in RINEX units; what was not sent is not there. ``leap``: GPS time minus UTC, for GLONASS.
+    in RINEX units; numbers that were not sent are absent. ``leap``: GPS time minus UTC (s), for GLONASS.
     """
 
     gnss: Gnss
@@ -169,7 +172,7 @@ class Broadcast(NamedTuple):
 
 
 def usual_message(gnss: Gnss, sv_id: int, source: float = 0.0) -> Message | None:
-    """Return the message that is meant where only the satellite is named, None for a constellation without any.
+    """Return the usual message of a satellite, where only the satellite is named; None without broadcast ephemerides.
 
     ``source``: Galileo's data sources (RINEX 3.04, table A8): bit 9 clock of E5b, bit 8 of E5a; bits 0 and 2 I/NAV, bit
     1 F/NAV.
@@ -188,10 +191,9 @@ def kepler_record(gnss: Gnss, sv_id: int, message: Message, toc: Instant, fields
     """Return the record (EPHEMERIS) of a message with Kepler elements: all constellations but GLONASS.
 
     ``toc``: clock reference on the constellation's own time scale, its week counted from 6 January 1980. ``fields``:
-    `KEPLER_FIELDS`, `CLOCK_FIELDS`, ``toe`` (seconds of own week; where it is missing ``toc`` is meant), ``issue``,
-    ``health``, ``accuracy``, ``sent`` (seconds of own week), ``fit`` (hours) and the delays ``tgd``, ``tgd2``,
-    ``isc_*``, ``bgd_*``, in RINEX units. What is missing is NaN and, if the orbit needs it, refused by
-    `Ephemerides.add`.
+    `KEPLER_FIELDS`, `CLOCK_FIELDS`, ``toe`` (seconds of own week; default ``toc``), ``issue``, ``health``,
+    ``accuracy``, ``sent`` (seconds of own week), ``fit`` (hours) and the delays ``tgd``, ``tgd2``, ``isc_*``,
+    ``bgd_*``, in RINEX units. Missing numbers are NaN; if the orbit needs them, `Ephemerides.add` refuses the record.
     """
     record = np.zeros(1, EPHEMERIS)[0]
     offset = BEIDOU_OFFSET if gnss == Gnss.BEIDOU else 0.0
@@ -251,11 +253,11 @@ def glonass_record(sv_id: int, tb_utc: Instant, leap: int, fields: Fields) -> np
 def group_delays(gnss: Gnss, message: Message, fields: Fields) -> NDArray[np.float64]:
     """Return the group delay (s) of each slot: what a user of that signal alone subtracts from the clock polynomial.
 
-    NaN where the message does not tell. The polynomials refer to:
+    NaN if the message does not tell. The polynomials refer to:
 
     - GPS, QZSS: L1 P(Y) and L2 P(Y), or L1 C/A and L2C, combined free of the ionosphere. IS-GPS-200N, sections
-      20.3.3.3.3.2 (TGD) and 30.3.3.3.1.1 (ISC, CNAV), IS-GPS-705 (L5), IS-GPS-800 (L1C); IS-QZSS-PNT. LNAV takes L1
-      C/A for L1 P(Y) and L2C for L2 P(Y): a few decimetres.
+      20.3.3.3.3.2 (TGD) and 30.3.3.3.1.1 (ISC, CNAV), IS-GPS-705 (L5), IS-GPS-800 (L1C); IS-QZSS-PNT. LNAV takes L1 C/A
+      for L1 P(Y) and L2C for L2 P(Y): a few decimetres.
     - Galileo: I/NAV to E1 and E5b, F/NAV to E1 and E5a (OS-SIS-ICD 2.1, section 5.1.5). E5a with the clock of I/NAV
       follows from both: E1 leaves BGD(E1,E5b) after the one and BGD(E1,E5a) after the other clock.
     - BeiDou: B3I (BDS-SIS-ICD-B1I 3.0, B1C 1.0, B2a 1.0, B2b 1.0).
@@ -271,7 +273,7 @@ def group_delays(gnss: Gnss, message: Message, fields: Fields) -> NDArray[np.flo
                 delays[slot] = tgd - value[name]
             delays[6], delays[7] = tgd - value["isc_l1cd"], tgd - value["isc_l1cp"]
             if gnss == Gnss.QZSS:
-                # L1 C/B leaves as L1 C/A does.
+                # L1 C/B has the group delay of L1 C/A.
                 delays[1] = delays[0]
     elif gnss == Gnss.GALILEO:
         e5a, e5b = value["bgd_e5a"], value["bgd_e5b"]
@@ -293,12 +295,12 @@ def group_delays(gnss: Gnss, message: Message, fields: Fields) -> NDArray[np.flo
 
 
 def unhealthy_slots(gnss: Gnss, message: Message, health: int) -> int:
-    """Return a bit for each slot whose signal, or its data, is not to be used, from the health word as RINEX gives it.
+    """Return a bit for each slot whose signal or data must not be used, from the health word as in RINEX.
 
     GPS LNAV and BeiDou: anything but zero condemns the satellite. GPS CNAV: bits of L1, L2, L5 (IS-GPS-200N, section
     30.3.3.1.1.2; satellites without L5 say so here). QZSS LNAV: L1 as a whole, L1 C/A, L2C, L5, L1C, L1 C/B, of which
-    L1 C/A and L1 C/B exclude each other (IS-QZSS-PNT). Galileo: validity and health of E1, E5a, E5b
-    in three bits each (RINEX 3.04, table A8).
+    L1 C/A and L1 C/B exclude each other (IS-QZSS-PNT). Galileo: validity and health of E1, E5a, E5b in three bits each
+    (RINEX 3.04, table A8).
     """
     if gnss == Gnss.GALILEO:
         return sum(1 << slot for slot in range(3) if health >> (3 * slot) & 7)
@@ -312,7 +314,7 @@ def unhealthy_slots(gnss: Gnss, message: Message, health: int) -> int:
 
 
 class Ephemerides:
-    """A store of ephemerides in a fixed order, each issue once: the same whatever order they came in.
+    """A store of ephemerides in a fixed order without duplicates, independent of the order in which they came.
 
     ``records`` (EPHEMERIS) is sorted by satellite, message and time; ``first`` is its index: the satellite ``sv_id`` of
     ``gnss_id`` has ``records[first[k]:first[k + 1]]`` with k = 256 gnss_id + sv_id. ``refused`` counts by `Fault`.
@@ -330,13 +332,13 @@ class Ephemerides:
         return len(self.records)
 
     def add(self, records: NDArray[np.void]) -> None:
-        """Take records (EPHEMERIS); those with a `Fault` are counted in ``refused`` and left out."""
+        """Add records (EPHEMERIS); those with a `Fault` are counted in ``refused`` and left out."""
         faults = check(records)
         for fault in (Fault.NON_FINITE, Fault.BAD_VALUE):
             self.refused[fault] += int(np.count_nonzero(faults == fault))
         sound = records[faults == Fault.NONE]
         if self._known.issuperset(_payloads(sound).tolist()):
-            # A receiver repeats what it knows: nothing to sort.
+            # A receiver repeats known ephemerides: nothing to sort.
             self.refused[Fault.DUPLICATE] += len(sound)
             return
         sorted_once, duplicates = _sorted_once(np.concatenate([self.records, sound]))
@@ -344,15 +346,15 @@ class Ephemerides:
         self._hold(sorted_once)
 
     def unknown(self, records: NDArray[np.void]) -> NDArray[np.void]:
-        """Return those of the records that have no `Fault` and are not here yet, byte for byte."""
+        """Return those records that have no `Fault` and are not in the store yet, byte for byte."""
         fresh = records[[payload not in self._known for payload in _payloads(records).tolist()]]
         return fresh[check(fresh) == Fault.NONE]
 
     def drop_ended(self, week: int, seconds: float) -> None:
         """Forget records whose time (``toe`` and ``max_age``) ended before an instant of GPS time.
 
-        The last one of each message of a satellite stays: it tells a satellite whose ephemerides are old from one that
-        has never had any.
+        The last record of each message of a satellite stays: it distinguishes a satellite with old ephemerides from one
+        that never had any.
         """
         records = self.records
         since_toe = (week - records["toe_week"]) * SECONDS_PER_WEEK + (seconds - records["toe"])
@@ -364,7 +366,7 @@ class Ephemerides:
             self._hold(records[kept])
 
     def _hold(self, records: NDArray[np.void]) -> None:
-        """Take records in their order as all there are."""
+        """Replace the content of the store by sorted records."""
         self.records = records
         self._known = set(_payloads(records).tolist())
         keys = SATELLITE_KEYS * records["gnss_id"].astype(np.int64) + records["sv_id"]
@@ -377,7 +379,7 @@ class Ephemerides:
 
 
 def check(records: NDArray[np.void]) -> NDArray[np.int64]:
-    """Return a `Fault` for each record: parameters that are missing, or that no satellite of its kind can have."""
+    """Return a `Fault` for each record: missing parameters, or values that no satellite of its kind can have."""
     glonass = records["gnss_id"] == Gnss.GLONASS
     finite = np.isfinite(records["toe"] + records["toc"] + records["af0"] + records["af1"] + records["af2"])
     kepler = np.stack([records[name] for name in KEPLER_FIELDS], axis=-1)
@@ -401,12 +403,12 @@ def check(records: NDArray[np.void]) -> NDArray[np.int64]:
 
 
 def _payloads(records: NDArray[np.void]) -> NDArray[np.bytes_]:
-    """Return the bytes of each record, to be compared: zeros at their end do not count, which none is shorter by."""
+    """Return the bytes of each record, for comparisons; these ignore zeros at the end, which does no harm here."""
     return np.ascontiguousarray(records).view(f"S{EPHEMERIS.itemsize}")
 
 
 def _sorted_once(records: NDArray[np.void]) -> tuple[NDArray[np.void], int]:
-    """Return the records in their order, of each issue the one sent last, and how many were left out."""
+    """Return the sorted records, of each issue the one sent last, and the number of those left out."""
     sent = records["sent_week"] * SECONDS_PER_WEEK + np.nan_to_num(records["sent"], nan=-np.inf)
     payload = _payloads(records)
     identity = [records[name] for name in ("gnss_id", "sv_id", "message", "toe_week", "toe", "issue")]
@@ -443,7 +445,7 @@ def _broadcast(fields: Fields, name: str) -> float:
 
 
 def _seconds(value: float) -> float:
-    """Return seconds of a week, NaN for what is no time within years of it."""
+    """Return seconds of a week; NaN for a number that is far from any week."""
     return value if abs(value) < 1e8 else math.nan
 
 

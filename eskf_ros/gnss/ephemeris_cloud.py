@@ -1,10 +1,10 @@
 """The topic `gnss/ephemerides`: one point per navigation message, its numbers as FLOAT64 fields in RINEX units.
 
-Fields by name, any order, NaN for what was not sent: ``gnss_id``, ``sv_id``, ``message`` (`ephemeris.Message`; where it
-is missing the usual one of the satellite), ``toc_week`` and ``toc`` (reference of the clock on the constellation's own
+Fields by name, any order, NaN for numbers that were not sent: ``gnss_id``, ``sv_id``, ``message`` (`ephemeris.Message`;
+default: the usual one of the satellite), ``toc_week`` and ``toc`` (reference of the clock on the constellation's own
 time scale, for GLONASS tb in UTC; weeks count from 6 January 1980), and the names of `ephemeris.kepler_record` and
 `ephemeris.glonass_record`: angles in rad, distances in m (GLONASS km), times in s. ``alpha0`` to ``beta3`` are the
-Klobuchar parameters that go with the constellation.
+Klobuchar parameters of the constellation.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from eskf_ros.gnss.signals import Gnss
 from eskf_ros.gnss.time import SECONDS_PER_WEEK, date_of, leap_seconds
 
 MAX_EPHEMERIDES = 4000
-"""Points of a message that are read: a day of all constellations."""
+"""Points of a message that are read, at most: a day of all constellations."""
 
 REQUIRED = ("gnss_id", "sv_id", "toc_week", "toc", "af0", "af1")
 
@@ -54,8 +54,8 @@ NO_TIME = "no reference time"
 class EphemerisCloud:
     """Content of a message.
 
-    ``broadcasts``: the navigation messages; ``klobuchar``: parameters (8,) by constellation, where given; ``refused``:
-    points by the reason why they were left out.
+    ``broadcasts``: the navigation messages; ``klobuchar``: parameters (8,) by constellation, if given; ``refused``:
+    number of points left out, by reason.
     """
 
     broadcasts: list[Broadcast] = field(default_factory=list)
@@ -69,7 +69,7 @@ class EphemerisCloud:
 
 
 def read_ephemerides(found: NDArray[Any]) -> EphemerisCloud:
-    """Return the navigation messages in the points of a cloud. Raises CloudError when a required field is missing."""
+    """Return the navigation messages in the points of a cloud. Raises CloudError if a required field is missing."""
     require(found, REQUIRED)
     read = EphemerisCloud()
     if len(found) > MAX_EPHEMERIDES:

@@ -55,8 +55,8 @@ def line_of_sight(satellite, satellite_velocity, receiver, receiver_velocity, al
     """Return unit vector to the satellite, range (m) and range rate (m/s), as an antenna at ``receiver`` sees them.
 
     ``satellite`` and its velocity: ECEF of transmission, or of reception if ``already_turned``. The range rate is the
-    derivative of the range with respect to the time of reception: the light time changes too, which divides by 1 +
-    u.v/c with the inertial velocity v of the satellite (up to 5 mm/s; Groves, section 8.5.3).
+    derivative of the range by the time of reception: the light time changes, too, which divides it by 1 + u.v/c with
+    the inertial velocity v of the satellite (up to 5 mm/s; Groves, section 8.5.3).
     """
     if not already_turned:
         position = turned_at_arrival(satellite, receiver)

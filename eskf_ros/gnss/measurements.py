@@ -1,15 +1,15 @@
-"""What a filter takes of an epoch: each signal cleared of all that does not depend on the state of the receiver.
+"""Measured signals of an epoch for a filter: all corrections that do not depend on the receiver are applied.
 
     pseudorange + c satellite clock = range      + c receiver clock + ionosphere + troposphere
     range rate  + c satellite drift = range rate + c receiver drift
 
-The left sides are ``pseudorange`` and ``range_rate`` of a MEASURED_SIGNAL, the right sides are the filter's:
-`predict_measured` gives them (without the receiver's clock) with line of sight and standard deviations.
+The left sides are ``pseudorange`` and ``range_rate`` of a MEASURED_SIGNAL, the right sides are predicted by the filter:
+`predict_measured` gives them (without the receiver clock) with line of sight and standard deviations.
 
-Where the receiver is decides three things: how far the Earth has turned under the signal, the elevation, and by it the
-standard deviation by model. `measure` settles them if it is told a position, which 100 m off changes nothing;
-`predict_measured` does it anew for any position. A filter whose result must not depend on the order of arrival calls
-`measure` without a position when a message comes, and `predict_measured` when it is applied.
+Three things depend on the position of the receiver: the rotation of the Earth during the flight of the signal, the
+elevation, and the standard deviation by model. `measure` settles them if it is given a position, for which 100 m are
+accurate enough; `predict_measured` computes them for any position. A filter whose result must not depend on the order
+of arrival calls `measure` without a position when a message comes, and `predict_measured` when it is applied.
 """
 
 from __future__ import annotations
@@ -60,31 +60,31 @@ MEASURED_SIGNAL = np.dtype(
     ],
     align=True,
 )
-"""One signal as the filter takes it; no gaps between the fields, equal content is equal bytes.
+"""One signal as the filter takes it; there are no gaps between the fields, so equal content means equal bytes.
 
-``gnss_id``, ``sv_id``: u-blox constellation and satellite number; ``signal``: index into `signals.SIGNALS` (255
-unknown). ``system``: `signals.time_group`, 0 to 7, the satellites that share an offset in the receiver's clock.
-``status``: `ranges.Status`; anything but USABLE (0) means: do not use, and why. ``flags``: bits of `ranges`; of a
-usable signal `CODE_VALID` says that ``pseudorange`` holds, `DOPPLER_VALID` that ``range_rate`` does (never both
-missing), `IONOSPHERE_APPLIED` and `TROPOSPHERE_APPLIED` that the delay has been taken out, `ALREADY_TURNED` that
-``satellite`` and ``satellite_velocity`` are in the ECEF frame of reception.
-
-``pseudorange``: m, satellite clock with relativity and group delay taken out. ``range_rate``: m/s, -doppler c /
-carrier, satellite drift taken out; it grows when the satellite goes away. ``code_std`` m, ``range_rate_std`` m/s:
-the receiver's own where it gave one, by model where the position was known, else NaN. ``satellite`` m and
-``satellite_velocity`` m/s: ECEF at transmission. ``carrier_hz`` (NaN unknown: then no Doppler), ``cn0`` dB-Hz (NaN
-unknown), ``noise_factor``: of a combination of signals, 1 for a plain one. ``elevation``, ``azimuth``: rad, NaN where
-the position was not known.
+- ``gnss_id``, ``sv_id``: u-blox constellation and satellite number.
+- ``signal``: index into `signals.SIGNALS` (255 unknown).
+- ``system``: `signals.time_group`, 0 to 7, the satellites that share an offset in the receiver clock.
+- ``status``: `ranges.Status`; anything but USABLE (0) says why the signal must not be used.
+- ``flags``: bits of `ranges`. Of a usable signal `CODE_VALID` says that ``pseudorange`` is valid, `DOPPLER_VALID` that
+  ``range_rate`` is (at least one is), `IONOSPHERE_APPLIED` and `TROPOSPHERE_APPLIED` that the delay has been taken out,
+  `ALREADY_TURNED` that ``satellite`` and ``satellite_velocity`` are in the ECEF frame of reception.
+- ``pseudorange``: m, satellite clock with relativity and group delay taken out.
+- ``range_rate``: m/s, -doppler c / carrier, satellite drift taken out; positive if the satellite recedes.
+- ``code_std`` m, ``range_rate_std`` m/s: those of the receiver, else by model if the position was known, else NaN.
+- ``satellite`` m, ``satellite_velocity`` m/s: ECEF at transmission.
+- ``carrier_hz`` (NaN unknown: then no Doppler), ``cn0`` dB-Hz (NaN unknown).
+- ``noise_factor``: of a combination of signals, 1 for a plain one.
+- ``elevation``, ``azimuth``: rad, NaN if the position was not known.
 """
 
 UNKNOWN_POSITION = (math.nan, math.nan, math.nan)
 
 
 class Masks(NamedTuple):
-    """Which signals are left out: elevation below (rad), C/N0 below (dB-Hz; unknown passes).
+    """Signals to leave out: elevation below (rad), C/N0 below (dB-Hz; an unknown one passes).
 
-    ``one_per_satellite``: of several signals of a satellite one code and one Doppler, see
-    `ranges.choose_per_satellite`.
+    ``one_per_satellite``: keep one code and one Doppler of each satellite, see `ranges.choose_per_satellite`.
     """
 
     elevation: float = math.radians(10.0)
@@ -129,10 +129,11 @@ def measured_epoch(
 
 @njit
 def measure(ranges, week, seconds, receiver, records, first, ionosphere, weighting, masks, measured):
-    """`measured_epoch` for the arrays of an `Ephemerides`: fill ``measured``, return how many signals are usable.
+    """Do the work of `measured_epoch` for the arrays of an `Ephemerides`; return how many signals are usable.
 
-    ``ranges`` (RANGE) are located on the way, as `ranges.locate` does; one that has been refused before (its status is
-    neither USABLE nor NOT_LOCATED) stays so. ``receiver``: tuple of three, NaN for unknown.
+    ``ranges`` (RANGE) are located on the way, as by `ranges.locate`; one that was refused before (its status is neither
+    USABLE nor NOT_LOCATED) stays refused. ``receiver``: tuple of three, NaN for unknown. The result goes to
+    ``measured``.
     """
     known = not math.isnan(receiver[0] + receiver[1] + receiver[2])
     for k in range(len(ranges)):
@@ -147,9 +148,9 @@ def measure(ranges, week, seconds, receiver, records, first, ionosphere, weighti
 
 @njit
 def clear(observed, signal):
-    """Fill a MEASURED_SIGNAL from a located RANGE with all that the receiver's position does not decide."""
+    """Fill a MEASURED_SIGNAL from a located RANGE with all that does not depend on the receiver's position."""
     signal["gnss_id"], signal["sv_id"], signal["signal"] = observed["gnss_id"], observed["sv_id"], observed["signal"]
-    # An index into tables, also of a signal that is not usable.
+    # It is used as an index into tables, even if the signal is not usable.
     known = 0 <= observed["gnss_id"] < GNSS_COUNT
     signal["system"] = time_group(observed["gnss_id"], observed["sv_id"]) if known else 0
     signal["carrier_hz"], signal["cn0"] = observed["carrier_hz"], observed["cn0"]
@@ -176,7 +177,7 @@ def clear(observed, signal):
 
 @njit
 def at_receiver(measured, receiver, week, seconds, ionosphere, weighting):
-    """Add what the receiver's position (tuple, ECEF, m) decides: satellites turned, elevation, model deviations."""
+    """Add what depends on the receiver's position (tuple, ECEF, m): satellites turned, elevation, model deviations."""
     latitude, longitude, altitude = ecef_to_geodetic(receiver[0], receiver[1], receiver[2])
     local_to_ecef = east_north_up_to_ecef(latitude, longitude)
     prediction = np.zeros(1, PREDICTION)[0]
@@ -219,9 +220,9 @@ def turn(signal, receiver):
 
 @njit
 def choose_signals(measured, masks):
-    """Set the status of what the masks or `ranges.choose_per_satellite` leave out; return how many signals remain.
+    """Set the status of signals that the masks or `ranges.choose_per_satellite` leave out; return how many remain.
 
-    The elevation mask holds where elevations are known.
+    The elevation mask applies to signals with a known elevation.
     """
     leave_out_weak(measured, masks.cn0)
     for k in range(len(measured)):

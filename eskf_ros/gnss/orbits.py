@@ -27,7 +27,7 @@ RATE_GLONASS = 7.292115e-5
 RADIUS_GLONASS = 6378136.0
 J2_GLONASS = 1.0826257e-3
 GLONASS_STEP = 60.0
-"""Longest step (s) of the GLONASS integration: its error is below 0.5 mm after 15 min, 1 mm after half an hour."""
+"""s; longest step of the GLONASS integration: its error is below 0.5 mm after 15 min, 1 mm after half an hour."""
 
 TILT_SIN = math.sin(math.radians(-5.0))
 TILT_COS = math.cos(math.radians(-5.0))
@@ -64,9 +64,9 @@ def clock_polynomial(ephemeris, week, seconds):
 def transmission(ephemeris, week, seconds, pseudorange):
     """Return the seconds of ``week`` at which a signal left, for a pseudorange (m) tagged (week, seconds) on arrival.
 
-    The tag is the receiver's clock and may be off by anything: tag minus pseudorange / c is the satellite's clock at
-    transmission (IS-GPS-200N, section 20.3.3.3.3.1), whatever the receiver believes. Relativity and group delay, 0.1 us
-    at most, move a satellite by less than 0.4 mm and are left out.
+    The tag is by the receiver clock and may have any error: tag minus pseudorange / c is the satellite clock at
+    transmission (IS-GPS-200N, section 20.3.3.3.3.1), whatever the error is. Relativity and group delay, 0.1 us at most,
+    move a satellite by less than 0.4 mm and are neglected.
     """
     sent = seconds - pseudorange / SPEED_OF_LIGHT
     instant = sent
@@ -182,7 +182,7 @@ def integrated_orbit(ephemeris, time):
     state = (position[0], position[1], position[2], velocity[0], velocity[1], velocity[2])
     pull = ephemeris["acceleration"]
     third_bodies = (pull[0], pull[1], pull[2])
-    # A stale ephemeris is refused before; whatever comes here must end.
+    # Stale ephemerides are refused before; this only ensures that the loop ends.
     if not abs(time) < 1e6:
         return (math.nan, math.nan, math.nan), (math.nan, math.nan, math.nan)
     left = time

@@ -2,7 +2,7 @@
 
 Unknowns: position, receiver clock, and the offset of each further constellation to the first (time scales, and delays
 in the receiver); velocity and clock drift from Doppler. Gauss-Newton with Huber's weights against many moderate errors,
-then data snooping against the gross ones, both on residuals in units of their standard deviation.
+then data snooping against gross errors, both on residuals in units of their standard deviation.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 
 class SolutionStatus(IntEnum):
-    """What became of an epoch."""
+    """Outcome of the solution of an epoch."""
 
     SOLVED = 0
     TOO_FEW = 1
@@ -37,10 +37,10 @@ class SolutionStatus(IntEnum):
 class PointSettings(NamedTuple):
     """Options of `solve`.
 
-    ``elevation_mask`` rad, ``cn0_mask`` dB-Hz (unknown C/N0 passes). ``huber``: residual in standard deviations from
-    which on weights go down. ``exclusion``: residual in its own standard deviations from which on a range is a fault.
-    ``system_offset_std``, ``glonass_offset_std``: what is known of the offset between constellations, m.
-    ``poorest_std``: largest formal standard deviation of a position, m, that is still one.
+    ``elevation_mask`` rad, ``cn0_mask`` dB-Hz (unknown C/N0 passes). ``huber``: residual in standard deviations above
+    which the weight decreases. ``exclusion``: residual in its own standard deviations above which a range is a fault.
+    ``system_offset_std``, ``glonass_offset_std``: prior standard deviation of the offset between constellations, m.
+    ``poorest_std``: largest formal standard deviation of a position, m, that is accepted.
     """
 
     elevation_mask: float = math.radians(10.0)
@@ -56,14 +56,20 @@ class PointSettings(NamedTuple):
 DEFAULT_SETTINGS = PointSettings()
 
 FEWEST = 4
+"""Ranges, at least, of a solution."""
+
 LOWEST_ALTITUDE = -10e3
+"""m; a position below is implausible."""
+
 HIGHEST_ALTITUDE = 100e3
+"""m; a position above is implausible."""
+
 _ITERATIONS = 12
-# A step so much smaller than the standard deviation is the last: Huber's weights may take many more to settle.
+# A step below this share of the standard deviation is the last: Huber's weights may need many more to converge.
 _NEGLIGIBLE = 0.01
 # While steps are longer than this, elevations mean nothing: no mask.
 _NEAR = 1e4
-# With so much redundancy the scale of the residuals can be told from the faults among them.
+# Redundancy from which on the scale of the residuals can be distinguished from faults among them.
 _REDUNDANCY_FOR_SCALE = 5
 _TESTABLE = 1e-3
 _FEWEST_HOLDING = 0.2
@@ -71,15 +77,15 @@ _FEWEST_HOLDING = 0.2
 
 @dataclass
 class PointSolution:
-    """Solution of one epoch; what could not be solved is NaN.
+    """Solution of one epoch; unsolved parts are NaN.
 
-    ``position_ecef`` m, ``velocity_ecef`` m/s, with covariances (3, 3); ``clock_bias`` (m, receiver minus the time of
-    ``reference``) and ``clock_drift`` (m/s) with standard deviations; ``system_offset`` (8,): m by
-    `signals.time_group`, by what a range of that group is longer than one of ``reference`` (NaN without ranges).
-    ``covariance``s are formal, and grow with the residuals where these are larger than modelled; ``variance_factor``
-    tells by how much. ``ranges`` are the given ones with their final status, ``predictions`` (PREDICTION) theirs, NaN
-    for those that were not usable; ``used`` is the number of ranges in the position, ``velocity_used`` in the
-    velocity.
+    - ``position_ecef`` m, ``velocity_ecef`` m/s: with covariances (3, 3).
+    - ``clock_bias`` (m, receiver minus the time of ``reference``), ``clock_drift`` (m/s): with standard deviations.
+    - ``system_offset`` (8,): offset (m) of the ranges of a `signals.time_group` from those of ``reference`` (NaN
+      without ranges).
+    - ``variance_factor``: factor of the formal covariances, above 1 where residuals are larger than modelled.
+    - ``ranges``: the given ones with their final status; ``predictions`` (PREDICTION): theirs, NaN for unusable ones.
+    - ``used``, ``velocity_used``: number of ranges in the position and in the velocity.
     """
 
     status: SolutionStatus
@@ -138,12 +144,12 @@ def solve(
 ) -> PointSolution:
     """Return position, velocity and clock from located ranges (RANGE) of one epoch, one per satellite.
 
-    Code and Doppler of a satellite may be two ranges, each with the flag of what it gives, as `one_per_satellite`
+    Code and Doppler of a satellite may be two ranges, each with the flag of its own measurement, as `one_per_satellite`
     leaves them; those without code serve the velocity alone.
 
     ``week``, ``seconds``: GPS time of the epoch, to a minute. ``klobuchar``: eight parameters, None if unknown: then
-    the ionosphere stays in the ranges that are not corrected for it, and in their standard deviation. ``initial``:
-    ECEF (m) to start from; not needed. Never raises for bad ranges: they have a status, and so has the solution.
+    the ionosphere stays in the ranges that are not corrected for it, and in their standard deviation. ``initial``: ECEF
+    (m) to start from; not needed. Bad ranges raise nothing: they have a status, and so has the solution.
     """
     solution = _blank(ranges)
     usable = (ranges["status"] == Status.USABLE) & (ranges["flags"] & (CODE_VALID | DOPPLER_VALID) != 0)
@@ -151,7 +157,7 @@ def solve(
         return solution
     ionosphere = NO_KLOBUCHAR if klobuchar is None else np.asarray(klobuchar, np.float64)
     epoch = _Epoch(ranges[usable], solution.predictions[usable], week, seconds, ionosphere, settings)
-    # Numbers beyond all measure end in a status, not in a warning.
+    # Absurd numbers end in a status, not in a warning of numpy.
     with np.errstate(all="ignore"):
         _solve_position(epoch, initial, solution)
         if solution.status == SolutionStatus.SOLVED:
@@ -228,7 +234,7 @@ def _solve_position(epoch: _Epoch, initial: Array | None, solution: PointSolutio
     low = weak = faulty
     adjusted = None
     near = False
-    # Each fault that is found costs a few steps more.
+    # Each fault that is excluded takes a few more steps.
     for _ in range(2 * _ITERATIONS + 2 * len(ranges)):
         epoch.predict(unknowns[:3], np.zeros(3))
         if near:
@@ -285,13 +291,13 @@ def _solve_position(epoch: _Epoch, initial: Array | None, solution: PointSolutio
 
 
 def _below(satellites: Array) -> Array:
-    """Return the point of the Earth's surface below the middle of the satellites (n, 3)."""
+    """Return the point (m, ECEF) of the Earth's surface below the mean position of the satellites (n, 3)."""
     middle = satellites.mean(axis=0)
     return np.asarray(middle * (SEMI_MAJOR_AXIS / np.linalg.norm(middle)))
 
 
 class _Adjustment(NamedTuple):
-    """A linear least-squares solution: step, its covariance, residuals after it, what their std says about each."""
+    """A linear least-squares solution: step, its covariance, and the residuals after it."""
 
     step: Array
     covariance: Array
@@ -300,7 +306,7 @@ class _Adjustment(NamedTuple):
     normalized: Array
     """Residuals in units of the standard deviation of the measurement."""
     freedom: Array
-    """Share of each measurement's error that shows in its residual (redundancy number), 0 to 1."""
+    """Share of each measurement's error that appears in its residual (redundancy number), 0 to 1."""
     redundancy: int
     scale: float
     """`_scale` of the residuals."""
@@ -308,19 +314,19 @@ class _Adjustment(NamedTuple):
 
     @property
     def negligible_step(self) -> float:
-        """Length of a step of the first three unknowns that changes nothing any more."""
+        """Length of a step of the first three unknowns below which the iteration ends."""
         return _NEGLIGIBLE * math.sqrt(np.trace(self.covariance[:3, :3]))
 
 
 def _adjust(
     design: Array, residual: Array, std: Array, weights: Array, unknowns: Array, prior_std: Array, huber: float
 ) -> _Adjustment | None:
-    """Solve design @ step = residual with standard deviations ``std`` and Huber's weights; None when it is singular.
+    """Solve design @ step = residual with standard deviations ``std`` and Huber's weights; None if it is singular.
 
-    ``weights``: to start from. ``prior_std``: standard deviations with which the ``unknowns`` are known to be zero (inf
-    for not at all). ``huber``: residual in standard deviations from which on weights go down. Iteratively
-    reweighted least squares (Huber, Robust Statistics, section 7.8): the sum it minimises is convex, so that neither
-    the start nor an outlier of any size leads it astray.
+    ``weights``: initial ones. ``prior_std``: prior standard deviations of the ``unknowns`` about zero (inf for none).
+    ``huber``: residual in standard deviations above which the weight decreases. Iteratively reweighted least squares
+    (Huber, Robust Statistics, section 7.8): the sum that it minimises is convex, so neither the start nor an outlier of
+    any size leads it astray.
     """
     whitened, observed = design / std[:, None], residual / std
     prior = np.diag(1.0 / prior_std**2)
@@ -348,10 +354,10 @@ def _adjust(
 
 
 def _scale(normalized: Array, redundancy: int) -> float:
-    """Return by how much residuals are larger than their standard deviations say, at least 1.
+    """Return the factor (at least 1) by which residuals exceed their standard deviations.
 
-    From their median, which a third of faults does not change much. With little redundancy a fault and large errors
-    throughout look the same: 1.
+    It follows from their median, on which faults in a third of them have little influence. With little redundancy one
+    fault and large errors throughout look the same: 1.
     """
     if redundancy < _REDUNDANCY_FOR_SCALE:
         return 1.0
@@ -359,11 +365,11 @@ def _scale(normalized: Array, redundancy: int) -> float:
 
 
 def _fault(adjusted: _Adjustment, settings: PointSettings) -> int | None:
-    """Return the index of the measurement that is most clearly a fault, None when there is none.
+    """Return the index of the measurement that is most clearly a fault; None if there is none.
 
     Baarda's data snooping (A testing procedure for use in geodetic networks, 1968): each residual in units of its own
     standard deviation, here times `_scale`, so that an epoch with large errors throughout is not stripped to the ranges
-    that happen to agree; the variance factor covers it.
+    that happen to agree; the variance factor covers such errors.
     """
     testable = adjusted.freedom > _TESTABLE
     if adjusted.redundancy < 2 or not testable.any():

@@ -1,6 +1,6 @@
-"""RINEX files beside a recording: epochs with stamps on the clock of the IMU, and navigation messages to go with them.
+"""RINEX files beside a recording: epochs with stamps on the IMU's clock, and navigation messages for them.
 
-Both are the structured arrays that the topics `gnss/ranges` and `gnss/ephemerides` become (`eskf_ros.gnss.cloud`,
+Both are the structured arrays of the topics `gnss/ranges` and `gnss/ephemerides` (`eskf_ros.gnss.cloud`,
 `eskf_ros.gnss.ephemeris_cloud`).
 """
 
@@ -40,8 +40,8 @@ class RangeFile:
 def read_range_file(path: str | os.PathLike[str], clock_offset: float = 0.0) -> RangeFile:
     """Read a RINEX observation file.
 
-    Stamps are its GPS time as computers keep UTC, plus ``clock_offset`` (s): by how much the clock of the recording is
-    ahead of UTC, 18 where it shows GPS time (2017 and later). Raises RinexError.
+    Stamps are its GPS time converted to Unix time (UTC as computers keep it), plus ``clock_offset`` (s): how far the
+    clock of the recording is ahead of UTC, 18 if it shows GPS time (2017 and later). Raises RinexError.
     """
     observations = read_observations(path)
     offset = round(clock_offset * 1e9)
@@ -51,7 +51,7 @@ def read_range_file(path: str | os.PathLike[str], clock_offset: float = 0.0) -> 
 
 @dataclass
 class NavigationFiles:
-    """What several navigation files hold together: messages, Klobuchar parameters (8,) of the last that gives them."""
+    """Content of several navigation files: messages, and Klobuchar parameters (8,) of the last file that has them."""
 
     broadcasts: list[Broadcast] = field(default_factory=list)
     klobuchar: dict[Gnss, NDArray[np.float64]] = field(default_factory=dict)
@@ -63,7 +63,7 @@ class NavigationFiles:
         return np.array([broadcast.record() for broadcast in self.broadcasts], EPHEMERIS)
 
     def serving(self, first: tuple[int, float], last: tuple[int, float]) -> list[Broadcast]:
-        """Return the messages that are in their time somewhere between two instants of GPS time."""
+        """Return the messages that are valid at some instant between two instants of GPS time."""
         records = self.records
         toe = records["toe_week"] * SECONDS_PER_WEEK + records["toe"]
         begin, end = (week * SECONDS_PER_WEEK + seconds for week, seconds in (first, last))

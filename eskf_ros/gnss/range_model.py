@@ -1,11 +1,11 @@
-"""What a receiver at a given place should measure: the observation equations of pseudorange and Doppler.
+"""Observation equations of pseudorange and Doppler for a receiver at a given position.
 
     pseudorange = range + c (receiver clock - satellite clock) + ionosphere + troposphere
     range rate  = -doppler wavelength = d(range)/dt + c (receiver drift - satellite drift)
 
-(Groves, section 9.4.1.) The receiver's clock, and the offset between constellations in it, are left to the
-caller: `predict` gives everything else, and the line of sight, of which minus one is the Jacobian by position
-(pseudorange) and by velocity (range rate).
+(Groves, section 9.4.1.) The receiver clock, and the offsets of constellations in it, are left to the caller: `predict`
+gives everything else, and the line of sight, which is minus the Jacobian by position (pseudorange) and by velocity
+(range rate).
 """
 
 from __future__ import annotations
@@ -38,17 +38,19 @@ PREDICTION = np.dtype(
     ],
     align=True,
 )
-"""What a range should be, without the receiver's clock.
+"""Prediction of a range without the receiver clock.
 
-``line_of_sight``: unit vector to the satellite, ECEF. ``pseudorange`` m, ``range_rate`` m/s: predicted, satellite
-clock and drift included. ``ionosphere`` (NaN where no model is known), ``troposphere``: delays m. ``code_residual``,
-``doppler_residual``: measured minus predicted, m and m/s. ``code_std``, ``doppler_std``: the receiver's own where it
-gave one, else by model, m and m/s.
+``line_of_sight``: unit vector to the satellite, ECEF. ``elevation``, ``azimuth``: rad. ``pseudorange`` m,
+``range_rate`` m/s: predicted, satellite clock and drift included. ``ionosphere`` (NaN without a model),
+``troposphere``: delays m. ``code_residual``, ``doppler_residual``: measured minus predicted, m and m/s. ``code_std``,
+``doppler_std``: those of the receiver, else by model, m and m/s.
 """
 
 NO_KLOBUCHAR = np.full(8, math.nan)
+"""Klobuchar parameters if there are none."""
+
 UNMODELLED_IONOSPHERE = 7.0
-"""Standard deviation (m) of the delay at the zenith where there is no ionosphere model."""
+"""m; standard deviation of the ionospheric delay at the zenith without a model."""
 
 
 @njit
@@ -93,7 +95,7 @@ def predict_one(
     weighting,
     prediction,
 ):
-    """`predict` for one range; latitude, longitude (rad), altitude (m) and the local axes are those of ``position``."""
+    """Write the PREDICTION of one range; latitude, longitude (rad), altitude (m), local axes: of ``position``."""
     wavelength = SPEED_OF_LIGHT / observed["carrier_hz"]
     sight(
         observed,

@@ -1,4 +1,4 @@
-"""Observed ranges of one epoch: what a receiver measured, and the satellite each measurement belongs to.
+"""Observed ranges of one epoch: the measurements of a receiver, and the satellite of each.
 
 A RANGE is one point of the topic `gnss/ranges`, or one signal of a RINEX file. `locate` completes it with the state of
 the satellite from the ephemerides; `status` says why a range cannot be used.
@@ -36,10 +36,11 @@ from eskf_ros.gnss.time import SECONDS_PER_WEEK, elapsed
 class Status(IntEnum):
     """Why a range is not used (a closed list).
 
-    ``NOT_LOCATED``: no one has looked yet. ``DUPLICATE``: the satellite and signal came before in the same epoch.
+    ``NOT_LOCATED``: not examined yet. ``DUPLICATE``: the same satellite and signal came before in the same epoch.
     ``OTHER_SIGNAL``: another signal of the satellite is used. ``WRONG_TIME``: its time tag is not that of its epoch.
-    ``WRONG_WEEK``: an ephemeris would fit if the week were another. ``TOO_MANY``: beyond the most signals of an epoch.
-    ``OTHER_BAND``: a code of another band than L1 without Doppler, and nothing else of the satellite is used.
+    ``WRONG_WEEK``: an ephemeris would fit if the week were another. ``TOO_MANY``: beyond the largest number of signals
+    of an epoch. ``OTHER_BAND``: a code of another band than L1 without Doppler, and nothing else of the satellite is
+    used.
     """
 
     USABLE = 0
@@ -94,19 +95,22 @@ RANGE = np.dtype(
 )
 """One measured signal.
 
-``signal``: index into `signals.SIGNALS`. ``flags``: the bits above, as in the topic; those that end in APPLIED speak
-of the pseudorange, `CLOCK_APPLIED` of satellite clock and group delay together. ``issue``: of the ephemeris used.
-``pseudorange`` m, ``doppler`` Hz (positive when approaching), their standard deviations (NaN: by model), ``cn0`` dB-Hz
-(NaN unknown). ``noise_factor``: what a combination multiplies the receiver's noise and multipath with, 1 for a plain
-range. ``satellite``, ``satellite_velocity``: ECEF at transmission (m, m/s), of reception with `ALREADY_TURNED`.
-``satellite_clock`` (s): with relativity, and less the group delay of this signal; ``satellite_clock_drift`` s/s.
+- ``signal``: index into `signals.SIGNALS`.
+- ``flags``: the bits above, as in the topic; those that end in APPLIED concern the pseudorange, `CLOCK_APPLIED`
+  satellite clock and group delay together.
+- ``issue``: of the ephemeris used.
+- ``pseudorange`` m, ``doppler`` Hz (positive when approaching), their standard deviations (NaN: by model), ``cn0``
+  dB-Hz (NaN unknown).
+- ``noise_factor``: factor of a combination on the receiver's noise and multipath, 1 for a plain range.
+- ``satellite``, ``satellite_velocity``: ECEF at transmission (m, m/s), of reception with `ALREADY_TURNED`.
+- ``satellite_clock`` (s): with relativity, minus the group delay of this signal; ``satellite_clock_drift`` s/s.
 """
 
-# Farther than any satellite from any place on or above the Earth; nearer than a receiver clock is ever off.
+# Limits of pseudoranges (m) that hold even with a large error of the receiver clock, and of Doppler (Hz).
 SHORTEST_PSEUDORANGE = 1e6
 LONGEST_PSEUDORANGE = 1e8
 LARGEST_DOPPLER = 1e5
-# Impossible for a satellite of navigation: nearer, farther, faster, a clock farther off.
+# Limits of a navigation satellite: distance from the centre of the Earth (m), speed (m/s), clock (s), drift (s/s).
 NEAREST_SATELLITE = 6.5e6
 FARTHEST_SATELLITE = 1e8
 FASTEST_SATELLITE = 1e4
@@ -117,14 +121,14 @@ HIGHEST_CARRIER_HZ = 1.7e9
 HIGHEST_CN0 = 100.0
 
 DEFAULT_CN0_MASK = 28.0
-"""dB-Hz: below it a signal is hardly tracked."""
+"""dB-Hz; a receiver hardly tracks signals below it."""
 
 _LOW_CN0 = int(Status.LOW_CN0)
 _SIGNAL_COUNT = len(SIGNALS)
 
 
 def _blank() -> bytes:
-    """Return the bytes of a range in which nothing is known yet."""
+    """Return the bytes of an unknown range."""
     row = np.zeros(1, RANGE)
     for name in RANGE.names or ():
         if RANGE[name].base.kind == "f":
@@ -140,7 +144,7 @@ _BLANK = _blank()
 
 
 def allocate_ranges(count: int) -> NDArray[np.void]:
-    """Return ``count`` ranges (RANGE) in which nothing is known yet."""
+    """Return ``count`` unknown ranges (RANGE)."""
     return np.frombuffer(bytearray(_BLANK * count), RANGE)
 
 
@@ -148,22 +152,23 @@ def locate(ranges: NDArray[np.void], week: int, seconds: float, ephemerides: Eph
     """Complete the ranges (RANGE, in place) of one epoch with satellite state, carrier and status.
 
     ``week``, ``seconds``: time tag of the epoch by the receiver's clock in GPS time. Ranges that bring their satellite
-    (`SATELLITE_KNOWN`) keep it. This is the door: a number that cannot be becomes NaN, or the status says so.
+    (`SATELLITE_KNOWN`) keep it. This is where ranges are checked: an impossible number becomes NaN or leads to a
+    status.
     """
     locate_all(ranges, week, seconds, ephemerides.records, ephemerides.first)
 
 
 def status_counts(ranges: NDArray[np.void]) -> Counter[Status]:
-    """Return how many ranges have which status."""
+    """Return the number of ranges by status."""
     values, counts = np.unique(ranges["status"], return_counts=True)
     return Counter({Status(value): int(count) for value, count in zip(values, counts)})
 
 
 def one_per_satellite(ranges: NDArray[np.void], cn0_mask: float = DEFAULT_CN0_MASK) -> NDArray[np.void]:
-    """Return of each satellite one code and one Doppler, as `choose_per_satellite` says, in the order of satellites.
+    """Return one code and one Doppler of each satellite, as by `choose_per_satellite`, in the order of satellites.
 
-    They are one range where the same signal gives both, else two, each with the flag of what it gives. Signals with a
-    C/N0 below ``cn0_mask`` (dB-Hz) are left out before, as in tight coupling.
+    They are one range if the same signal gives both, else two, each with the flag of its own measurement. Signals with
+    a C/N0 below ``cn0_mask`` (dB-Hz) are left out before, as in tight coupling.
     """
     chosen = ranges.copy()
     leave_out_weak(chosen, cn0_mask)
@@ -211,13 +216,13 @@ def leave_out_weak(signals, cn0_mask):
 
 @njit
 def choose_per_satellite(signals, one_of_each):
-    """Leave of each satellite's usable signals (RANGE, MEASURED_SIGNAL) what may be used; return how many are left.
+    """Choose the code and the Doppler of each satellite (RANGE, MEASURED_SIGNAL); return how many signals are left.
 
-    Code is taken of the upper band only (`signals.is_upper_band`): the receiver delays other bands differently, and its
-    clock would take the difference for the satellite's. With ``one_of_each`` a satellite gives one code, of the signal
-    that comes first in `signals.SIGNALS`, and one Doppler, of the same signal if it has one, else of the first of any
-    band: several share the errors of orbit, clock and atmosphere; taken as independent they are believed too much.
-    The flags say what a signal is left to give. Of equal signals the first to come counts.
+    Code is taken from the upper band only (`signals.is_upper_band`): the receiver delays other bands differently, and
+    its clock would absorb the difference. With ``one_of_each`` a satellite gives one code, from the first of its
+    signals in `signals.SIGNALS`, and one Doppler, from the same signal if it has one, else from the first of any band:
+    several signals share the errors of orbit, clock and atmosphere and are not independent. The flags tell what a
+    remaining signal gives. Of equal signals the first in the epoch counts.
     """
     for k in range(len(signals)):
         if signals[k]["status"] == Status.USABLE and is_double(signals, k):
@@ -249,7 +254,7 @@ def choose_per_satellite(signals, one_of_each):
 
 @njit
 def is_double(signals, k):
-    """True when an earlier usable signal is of the same satellite and the same kind."""
+    """Return whether an earlier usable signal is of the same satellite and kind."""
     signal = signals[k]
     for earlier in range(k):
         other = signals[earlier]
@@ -265,13 +270,13 @@ def is_double(signals, k):
 
 @njit
 def of_one_satellite(first, second):
-    """True when two signals are of the same satellite."""
+    """Return whether two signals are of the same satellite."""
     return first["gnss_id"] == second["gnss_id"] and first["sv_id"] == second["sv_id"]
 
 
 @njit
 def gives(signal, flag):
-    """True when a signal has a code (`CODE_VALID`) of the band that is used, or a Doppler (`DOPPLER_VALID`) in m/s."""
+    """Return whether a signal has a code (`CODE_VALID`) of the band in use, or a Doppler (`DOPPLER_VALID`) in m/s."""
     if not signal["flags"] & flag:
         return False
     if flag == CODE_VALID:
@@ -281,9 +286,9 @@ def gives(signal, flag):
 
 @njit
 def first_of_satellite(signals, k, flag):
-    """Return which usable signal of the satellite of ``signals[k]`` comes first among those that give it, -1 for none.
+    """Return the first usable signal of the satellite of ``signals[k]`` that gives ``flag``; -1 if there is none.
 
-    First in `signals.SIGNALS`; of signals that are not listed the one with the higher carrier.
+    The order is that of `signals.SIGNALS`; of unlisted signals the one with the higher carrier comes first.
     """
     first = -1
     for other in range(len(signals)):
@@ -297,7 +302,7 @@ def first_of_satellite(signals, k, flag):
 
 @njit
 def precedes(first, second):
-    """True when of two different signals of a satellite the first is the one to use."""
+    """Return whether the first of two different signals of a satellite is preferred."""
     if first["signal"] != second["signal"]:
         return first["signal"] < second["signal"]
     return first["carrier_hz"] > second["carrier_hz"]
@@ -305,7 +310,7 @@ def precedes(first, second):
 
 @njit
 def locate_all(ranges, week, seconds, records, first):
-    """`locate` for the arrays of an `Ephemerides`."""
+    """Do the work of `locate` for the arrays of an `Ephemerides`."""
     for k in range(len(ranges)):
         locate_one(ranges[k], week, seconds, records, first)
 
@@ -327,12 +332,12 @@ def locate_one(observed, week, seconds, records, first):
     if not 0.0 < observed["doppler_std"] < math.inf:
         observed["doppler_std"] = math.nan
     if not LOWEST_CARRIER_HZ < observed["carrier_hz"] < HIGHEST_CARRIER_HZ:
-        # The channel of a GLONASS satellite moves the range rate by metres per second: without it no Doppler.
+        # An unknown GLONASS channel would change the range rate by metres per second: no Doppler without it.
         observed["carrier_hz"] = SIGNAL_CARRIER_HZ[signal] if known_signal and gnss != Gnss.GLONASS else math.nan
     if observed["flags"] & CLOCK_APPLIED:
         observed["satellite_clock"] = 0.0
     if not 0 <= gnss < GNSS_COUNT or not IS_CONSTELLATION[gnss]:
-        # It is an index into tables of constellations; a satellite of no system here has a time of its own.
+        # The number is an index into tables of constellations, and the time of other systems is unknown.
         observed["status"] = Status.UNKNOWN_SIGNAL
         return
     if math.isnan(observed["satellite_clock"]):
@@ -386,7 +391,7 @@ def locate_one(observed, week, seconds, records, first):
 
 @njit
 def satellite_is_possible(observed):
-    """True when position, velocity and clock of the satellite are numbers a satellite of navigation can have."""
+    """Return whether position, velocity and clock can be those of a navigation satellite."""
     distance2, speed2 = 0.0, 0.0
     for axis in range(3):
         distance2 += observed["satellite"][axis] ** 2
@@ -403,11 +408,11 @@ def satellite_is_possible(observed):
 def choose(records, first, gnss_id, sv_id, slot, week, seconds, issue):
     """Return the index of the ephemeris for a signal at an instant of GPS time, and a `Status`; index -1 for none.
 
-    Of the messages in their time (``max_lead``, ``max_age``) that give the group delay of ``slot``: the one first in
-    `ephemeris.Message`, and of its issues the one whose reference time is closest, as a share of the time allowed; with
-    ``issue`` (not `NO_ISSUE`) only that issue. What was sent only after the instant serves where nothing else does. The
-    satellite is unhealthy when this ephemeris says so, or the one sent last before the instant: an old good one is no
-    way around a new warning.
+    Of the valid messages (``max_lead``, ``max_age``) that give the group delay of ``slot`` the first in
+    `ephemeris.Message` is chosen, and of its issues the one whose reference time is closest, as a share of the time
+    allowed; with ``issue`` (not `NO_ISSUE`) only that issue. An ephemeris sent after the instant serves only if there
+    is no other. The satellite is unhealthy if this ephemeris says so, or the one sent last before the instant: an older
+    good one does not override a new warning.
     """
     if not (0 <= gnss_id < GNSS_COUNT and 0 <= sv_id < SATELLITE_KEYS):
         return -1, Status.NO_EPHEMERIS
@@ -429,7 +434,7 @@ def choose(records, first, gnss_id, sv_id, slot, week, seconds, issue):
             if reason < Status.NO_GROUP_DELAY:
                 reason = Status.NO_GROUP_DELAY
             continue
-        # NaN where it is not known: what the receiver has, has been sent.
+        # NaN if unknown: then it counts as sent, because the receiver has it.
         until_sent = elapsed(ephemeris["sent_week"], ephemeris["sent"], week, seconds)
         unsent = until_sent > 0.0
         later_message = chosen >= 0 and ephemeris["message"] > message
@@ -450,10 +455,10 @@ def choose(records, first, gnss_id, sv_id, slot, week, seconds, issue):
 
 @njit
 def fits_another_week(records, first, gnss_id, sv_id, week, seconds):
-    """True when an ephemeris of the satellite is in its time at these seconds of another week.
+    """Return whether an ephemeris of the satellite is valid at these seconds of another week.
 
-    A receiver that counts weeks by 1024, or starts with those of its firmware; a file that is left over from a day that
-    long ago looks the same for few of its satellites.
+    So it is with a receiver that counts weeks modulo 1024, or starts with the week of its firmware. With a file of
+    another day only a few satellites look like this.
     """
     key = SATELLITE_KEYS * gnss_id + sv_id
     for k in range(first[key], first[key + 1]):

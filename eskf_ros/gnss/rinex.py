@@ -1,4 +1,4 @@
-"""What RINEX navigation and observation files have in common: lines, header, numbers, complaints."""
+"""Parts that RINEX navigation and observation files share: lines, header, numbers, complaints."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 from eskf_ros.gnss.time import Instant, from_calendar
 
 KEPT_NOTES = 20
+"""Places of a file that are named, at most."""
 
 
 class RinexError(ValueError):
@@ -44,7 +45,7 @@ class Header:
 
 
 def read_lines(path: Path) -> list[str]:
-    """Return the lines of a text file. Raises RinexError when it cannot be read."""
+    """Return the lines of a text file. Raises RinexError if it cannot be read."""
     try:
         text = path.read_bytes().decode("ascii", "replace")
     except OSError as error:
@@ -53,7 +54,7 @@ def read_lines(path: Path) -> list[str]:
 
 
 def read_header(path: Path, lines: list[str]) -> Header:
-    """Return the header of a RINEX file, version 2 to 4. Raises RinexError when it is none, or compressed."""
+    """Return the header of a RINEX file, version 2 to 4. Raises RinexError if there is none, or it is compressed."""
     if not lines or lines[0][60:80].strip() != "RINEX VERSION / TYPE":
         if lines and lines[0][60:80].strip() == "CRINEX VERS   / TYPE":
             raise RinexError(f"{path}:1: Hatanaka-compressed RINEX: decompress it first (crx2rnx)")
@@ -71,12 +72,12 @@ def read_header(path: Path, lines: list[str]) -> Header:
 
 
 def number(text: str) -> float:
-    """Return a number as Fortran writes it (D for E), NaN for a blank. Raises ValueError for anything else."""
+    """Return a number in Fortran notation (D for E), NaN for a blank. Raises ValueError for anything else."""
     return numbers(text, 0, 1, len(text))[0]
 
 
 def numbers(line: str, start: int, count: int, width: int = 19) -> list[float]:
-    """Return ``count`` numbers of ``width`` columns each from column ``start`` on, as `number` does."""
+    """Return ``count`` numbers of ``width`` columns each from column ``start`` on, like `number`."""
     line = line.replace("D", "E").replace("d", "e")
     texts = [line[begin : begin + width] for begin in range(start, start + count * width, width)]
     return [float(text) if text and not text.isspace() else math.nan for text in texts]

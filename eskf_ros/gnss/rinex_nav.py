@@ -1,8 +1,8 @@
 """RINEX navigation files, versions 2, 3 and 4: GPS, Galileo, BeiDou, QZSS and GLONASS ephemerides, Klobuchar.
 
-RINEX 2.11 tables A4 and A11, RINEX 3.05 appendix A5 to A14, RINEX 4.00 section 5. The reader is tolerant: what it does
-not know (SBAS, NavIC, Earth orientation ...) and what it cannot read is left out, counted by reason, and the first
-places are named.
+RINEX 2.11 tables A4 and A11, RINEX 3.05 appendix A5 to A14, RINEX 4.00 section 5. The reader is tolerant: unknown
+records (SBAS, NavIC, Earth orientation ...) and unreadable ones are left out, counted by reason, and the first places
+are named.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ LAYOUTS: dict[tuple[Gnss, Message], tuple[str | None, ...]] = {
 _KLOBUCHAR = {"GPS": Gnss.GPS, "QZS": Gnss.QZSS, "BDS": Gnss.BEIDOU}
 _REFUSED_SYSTEMS = {"S": "SBAS", "I": "NavIC"}
 
-# The orbit parameters fill so many numbers at least; a shorter record is cut off.
+# Least count of numbers after the clock that contains all orbit parameters; a shorter record is cut off.
 _SHORTEST = {Message.FDMA: 11}
 _SHORTEST_KEPLER = 17
 
@@ -70,9 +70,9 @@ class Navigation:
     """Content of navigation files.
 
     ``broadcasts``: the messages in the order of the file. ``ephemerides``: the records (EPHEMERIS) made of them,
-    unchecked (`ephemeris.Ephemerides` checks, sorts, removes duplicates).
-    ``klobuchar``: eight parameters (alpha 0 to 3, beta 0 to 3) by constellation, where given.
-    ``leap_seconds``: of the header, None where absent. ``complaints``: what was left out.
+    unchecked (`ephemeris.Ephemerides` checks, sorts, removes duplicates). ``klobuchar``: eight parameters (alpha 0 to
+    3, beta 0 to 3) by constellation, if given. ``leap_seconds``: of the header, None if absent. ``complaints``: what
+    was left out.
     """
 
     broadcasts: list[Broadcast]
@@ -99,7 +99,7 @@ class _Reading:
 def read_navigation(path: str | os.PathLike[str]) -> Navigation:
     """Read a RINEX navigation file, version 2 (GPS or GLONASS), 3 or 4 (any).
 
-    Raises RinexError, naming file and line, when the file cannot be opened or is not a RINEX navigation file.
+    Raises RinexError, naming file and line, if the file cannot be opened or is not a RINEX navigation file.
     """
     path = Path(path)
     lines = read_lines(path)
@@ -171,7 +171,7 @@ def _blocks(header: Header, lines: list[str]) -> Iterator[tuple[int, str, list[s
 
 
 def _read_block(header: Header, index: int, kind: str, block: list[str], leap: int | None, reading: _Reading) -> None:
-    """Read one record. Raises ValueError when it cannot be read."""
+    """Read one record. Raises ValueError if it cannot be read."""
     if not block:
         raise ValueError("nothing follows its type")
     if header.version < 3.0:
@@ -212,14 +212,14 @@ def _read_block(header: Header, index: int, kind: str, block: list[str], leap: i
     fields["af0"], fields["af1"], fields["af2"] = clock_values
     reading.add(Broadcast(gnss, sv_id, message, *toc, fields))
     if "week" in fields and "toe" in fields:
-        # Weeks of 10 bits, and of BeiDou or Galileo time, count from elsewhere: BeiDou's from 1356, a rest of 332.
+        # Weeks may have 10 bits or another origin: that of BeiDou is GPS week 1356, 332 modulo 1024.
         difference = round(week_near(fields["toe"], toc) - fields["week"]) % 1024
         if difference not in (0, 332):
             reading.complaints.add(index, WRONG_WEEK, f"{letter}{satellite} week {fields['week']:.0f}")
 
 
 def _message(gnss: Gnss, sv_id: int, kind: str, orbit: list[float]) -> Message | None:
-    """Return the message a record is of; None when it is not among `Message`."""
+    """Return the navigation message of a record; None if it is not in `Message`."""
     words = kind.split()
     if len(words) >= 4:
         return Message.__members__.get(words[3])
@@ -228,7 +228,7 @@ def _message(gnss: Gnss, sv_id: int, kind: str, orbit: list[float]) -> Message |
 
 
 def _read_ionosphere(words: list[str], block: list[str], index: int, reading: _Reading) -> None:
-    """Take the Klobuchar parameters of a version 4 record. Raises ValueError when they cannot be read."""
+    """Take the Klobuchar parameters of a version 4 record. Raises ValueError if they cannot be read."""
     gnss = LETTERS.get(words[2][:1])
     if gnss is None or gnss not in _KLOBUCHAR.values() or words[3] not in ("LNAV", "D1D2"):
         reading.complaints.add(index - 1, f"ION {words[2][:1]} {words[3]} record not used")

@@ -42,7 +42,7 @@ def navigation_text(
 
 
 def rounded(value: float) -> float:
-    """Return a number as it comes back from the file."""
+    """Return the number that is read back after this number was written."""
     return float(_number(value))
 
 

@@ -1,7 +1,7 @@
 """RINEX observation files, versions 2, 3 and 4: pseudorange, Doppler and C/N0 of each signal, as arrays.
 
 RINEX 2.11 tables A1 and A2, RINEX 3.04 tables A2 and A3; version 4 observation files are those of version 3. Phases are
-not read. What is not known (SBAS, NavIC, events) and what cannot be read is left out and counted.
+not read. Unknown parts (SBAS, NavIC, events) and unreadable ones are left out and counted.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ OBSERVATION = np.dtype(
 """One signal at one epoch (index into the epochs): m, Hz (positive when approaching), dB-Hz; NaN where missing."""
 
 EPOCH = np.dtype([("week", "i4"), ("seconds", "f8"), ("first", "i8"), ("count", "i8")])
-"""Time tag in GPS time by the receiver's clock, and where the observations of the epoch are."""
+"""Time tag in GPS time by the receiver's clock, and index and number of the observations of the epoch."""
 
-# RINEX 2 names a code by band and C or P; which of several signals that was, it does not tell (RINEX 2.11, table 7).
+# RINEX 2 names a code by band and C or P, not by signal (RINEX 2.11, table 7).
 _RINEX2_CODES = {
     "G": {"C1": "1C", "P1": "1W", "C2": "2X", "P2": "2W", "C5": "5X"},
     "R": {"C1": "1C", "P1": "1P", "C2": "2C", "P2": "2P"},
@@ -90,7 +90,7 @@ class _Rows:
 def read_observations(path: str | os.PathLike[str]) -> Observations:
     """Read a RINEX observation file, version 2, 3 or 4.
 
-    Raises RinexError, naming file and line, when the file cannot be opened, is not a RINEX observation file, is
+    Raises RinexError, naming file and line, if the file cannot be opened, is not a RINEX observation file, is
     compressed, or does not say which observations it holds.
     """
     path = Path(path)
@@ -119,7 +119,7 @@ def read_observations(path: str | os.PathLike[str]) -> Observations:
 
 
 def _types(path: Path, header: Header) -> dict[str, list[str]]:
-    """Return the observation types by constellation letter. Raises RinexError when there are none."""
+    """Return the observation types by constellation letter. Raises RinexError if there are none."""
     types: dict[str, list[str]] = {}
     letter = ""
     for _, label, line in header.lines:
@@ -137,7 +137,7 @@ def _types(path: Path, header: Header) -> dict[str, list[str]]:
 
 
 def _scales(header: Header) -> dict[tuple[str, str], float]:
-    """Return what stored observations are to be divided by, by constellation and type ("" is any type)."""
+    """Return the divisors of stored observations, by constellation and type ("" is any type)."""
     scales: dict[tuple[str, str], float] = {}
     for _, label, line in header.lines:
         if label == "SYS / SCALE FACTOR" and line[2:6].strip().isdigit():
@@ -159,7 +159,7 @@ def _approximate_position(header: Header) -> NDArray[np.float64]:
 
 
 def _clock(header: Header) -> str:
-    """Return the time system of the epochs: GPS, GLO (UTC) or BDT; the others run with GPS time."""
+    """Return the time system of the epochs: GPS, GLO (UTC) or BDT; the others have GPS time."""
     for _, label, line in header.lines:
         if label == "TIME OF FIRST OBS" and line[48:51].strip():
             return line[48:51]
@@ -223,7 +223,7 @@ def _split_3(
 def _split_2(
     header: Header, lines: list[str], types: dict[str, list[str]], complaints: Complaints
 ) -> tuple[list[Instant], dict[str, _Rows]]:
-    """Return the epochs, and the observations of each satellite joined to one line, by constellation (version 2)."""
+    """Return the epochs, and the observations of each satellite in one line, by constellation (version 2)."""
     clock = _clock(header)
     instants: list[Instant] = []
     rows = {letter: _Rows([], [], [], []) for letter in types}

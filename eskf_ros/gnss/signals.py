@@ -58,10 +58,10 @@ LETTERS = {
     "J": Gnss.QZSS,
     "R": Gnss.GLONASS,
 }
-"""Constellation by the letter RINEX gives it."""
+"""Constellation by its letter in RINEX."""
 
 LOWEST_UPPER_BAND_HZ = 1.5e9
-"""L1, E1, B1 and G1 are above, all other carriers below."""
+"""Hz; the carriers L1, E1, B1 and G1 are above, all others below."""
 
 SLOT_COUNT = 8
 NO_SLOT = -1
@@ -70,8 +70,8 @@ NO_SLOT = -1
 class Signal(NamedTuple):
     """A signal: constellation, RINEX 3 name, carrier (Hz; of channel 0 for GLONASS), slot, u-blox ``sigId`` numbers.
 
-    ``slot``: place in the tables of group delay and health of an ephemeris (`eskf_ros.gnss.ephemeris`); signals whose
-    delay no message gives have `NO_SLOT`.
+    ``slot``: index in the tables of group delay and health of an ephemeris (`eskf_ros.gnss.ephemeris`); `NO_SLOT` if no
+    message gives the group delay.
     """
 
     gnss: Gnss
@@ -155,7 +155,7 @@ SIGNALS: tuple[Signal, ...] = (
     Signal(Gnss.GLONASS, "3I", G3, NO_SLOT),
     Signal(Gnss.GLONASS, "3X", G3, NO_SLOT),
 )
-"""All signals; of one satellite's signals the first in this list is the one a single-frequency user takes."""
+"""All signals; of the signals of one satellite the first in this list is used with a single frequency."""
 
 UNKNOWN_SIGNAL = 255
 """Index of a signal that is not in the list."""
@@ -180,7 +180,7 @@ def carrier_hz(signal, channel):
 
 @njit
 def is_upper_band(signal, carrier):
-    """True for a signal around L1: neither ``SIGNALS[signal]`` nor its carrier (Hz, NaN unknown) is of another band.
+    """Return whether a signal is around L1: neither ``SIGNALS[signal]`` nor its carrier (Hz, NaN unknown) denies it.
 
     Receivers delay the bands differently, by metres: a pseudorange of another band has another receiver clock in it.
     """
@@ -192,15 +192,16 @@ def is_upper_band(signal, carrier):
 
 @njit
 def is_beidou_geostationary(gnss_id, sv_id):
-    """True for the BeiDou satellites whose ephemeris is in a tilted frame (BDS-SIS-ICD-B1I 3.0, section 5.2.4)."""
+    """Return whether the ephemeris of a BeiDou satellite is in a tilted frame (BDS-SIS-ICD-B1I 3.0, section 5.2.4)."""
     return gnss_id == Gnss.BEIDOU and (sv_id <= 5 or sv_id >= 59)
 
 
 @njit
 def time_group(gnss_id, sv_id):
-    """Return which satellites share an offset in the receiver's clock: ``gnss_id``, and `BEIDOU_3` apart from BeiDou-2.
+    """Return the group of satellites with a common offset in the receiver clock: ``gnss_id``, or `BEIDOU_3`.
 
-    Receivers measure B1I of the two generations 1 to 3 m apart (0.5 ns and more in the filters and the group delays).
+    BeiDou-3 is apart from BeiDou-2 because receivers measure B1I of the two generations 1 to 3 m apart (0.5 ns and more
+    in the filters and the group delays).
     """
     return BEIDOU_3 if gnss_id == Gnss.BEIDOU and sv_id >= _FIRST_BEIDOU_3 else gnss_id
 

@@ -1,8 +1,8 @@
-"""GNSS time: GPS week and seconds of week, and how the time of the other systems relates to it.
+"""GNSS time: GPS week and seconds of week, and its relation to the time of the other systems.
 
-An instant is a pair (week, seconds of week) in GPS time everywhere in this package. One float of seconds since 1980
-resolves 0.2 us, in which a satellite flies a millimetre; the pair resolves 0.1 ns. Weeks count from 6 January 1980
-without rolling over.
+An instant is a pair (week, seconds of week) in GPS time everywhere in this package. A single float of seconds since
+1980 resolves 0.2 us, in which a satellite moves by a millimetre; the pair resolves 0.1 ns. Weeks count from 6 January
+1980 without rolling over.
 """
 
 from __future__ import annotations
@@ -83,8 +83,8 @@ def date_of(week: int, seconds: float) -> datetime.date:
 def week_near(seconds: float, near: Instant) -> int:
     """Return the week in which ``seconds`` of week are closest to the instant ``near``, at most half a week away.
 
-    Broadcast weeks are short (10 bits roll over every 1024 weeks) and often wrong by one around the turn of the week;
-    seconds of week with a calendar date nearby are neither.
+    Broadcast weeks are truncated (10 bits roll over every 1024 weeks) and often wrong by one around the end of a week;
+    seconds of week with a known date nearby have neither problem.
     """
     return near[0] + round((near[1] - seconds) / SECONDS_PER_WEEK)
 

@@ -20,12 +20,12 @@ LOWEST_SINE = math.sin(math.radians(5.0))
 
 
 class Weighting(NamedTuple):
-    """Parameters of the error model; a kernel takes it as it is.
+    """Parameters of the error model, in the form that a kernel takes.
 
-    ``code_zenith``, ``code_noise``: m. ``ionosphere_share``: standard deviation by modelled delay. ``doppler_floor``,
-    ``doppler_noise``: m/s. ``weak_factor``: what multiplies the standard deviation of code for GLONASS (its channels
-    have delays of their own) and geostationary BeiDou (their orbits are known less well). ``unknown_cn0``: dB-Hz that
-    stands in.
+    ``code_zenith``, ``code_noise``: m. ``ionosphere_share``: standard deviation as a share of the modelled delay.
+    ``doppler_floor``, ``doppler_noise``: m/s. ``weak_factor``: factor on the standard deviation of code for GLONASS
+    (its channels have different delays) and geostationary BeiDou (their orbits are less accurate). ``unknown_cn0``:
+    stand-in for an unknown C/N0, dB-Hz.
     """
 
     code_zenith: float = 0.8

@@ -1,1 +1,1 @@
-"""Ranges out of RINEX files beside a recording: merged while it is read, or written into a copy of it."""
+"""The inputs of the estimator for node and replay alike, and RINEX files as messages of a recording."""

@@ -1,4 +1,4 @@
-"""Messages of `gnss/ranges` and `gnss/ephemerides` on their way into the navigator: the same for node and replay."""
+"""Intake of `gnss/ranges` and `gnss/ephemerides`: from messages to the navigator, the same for node and replay."""
 
 from __future__ import annotations
 
@@ -37,20 +37,20 @@ from eskf_ros.gnss.time import Instant
 from eskf_ros.parameters.tree import Parameters
 
 HORIZON = math.radians(-90.0)
-"""No elevation mask: where the receiver is, only the filter knows."""
+"""rad; no elevation mask here, because only the filter knows where the receiver is."""
 
 DEFAULT_KLOBUCHAR = np.array(
     [0.1118e-07, -0.7451e-08, -0.5961e-07, 0.1192e-06, 0.1167e06, -0.2294e06, -0.1311e06, 0.1049e07]
 )
-"""Broadcast on 1 January 2004, a year of middling solar activity: stands in where no parameters came (as in RTKLIB).
-
-Zeros would leave the whole delay, metres that differ from satellite to satellite.
+"""Klobuchar parameters broadcast on 1 January 2004, a year of moderate solar activity: a stand-in where none came (as
+in RTKLIB). Zeros would leave the whole delay, metres that differ from satellite to satellite.
 """
 
 KLOBUCHAR_SOURCES = {Gnss.GPS, Gnss.QZSS}
-"""Whose parameters are those of one and the same model: GPS's are used, QZSS's where those are missing.
+"""Constellations whose ionosphere parameters belong to the same model: those of GPS are used, those of QZSS where they
+are missing.
 
-BeiDou's go with another one: geographic latitudes, a layer at 375 km, a period that has an upper limit
+The parameters of BeiDou belong to another model: geographic latitudes, a layer at 375 km, a period with an upper limit
 (BDS-SIS-ICD-B1I 3.0, section 5.2.4).
 """
 
@@ -67,30 +67,35 @@ REMEDIES = {
     Status.LOW_CN0: "ranges.cn0_mask leaves them out",
     Status.OTHER_BAND: "pseudoranges are used of the upper band only (L1, E1, B1, G1)",
 }
+"""What to do about signals that cannot be used, by the reason."""
 
 BLAMED_SHARE = 0.5
-"""Of all signals: so many that cannot be used for one reason are worth a sentence."""
+"""Share of the signals that must be unusable for one reason before the reason is reported."""
 
 RECENT = 60
-"""Messages that what is wrong at the moment is judged by: a minute of a slow receiver."""
+"""Messages by which present faults are judged: a minute of a slow receiver."""
 
 PLACE_INTERVAL = 10 * SECOND
+"""ns; in each such period of the stamps the place for the Earth's magnetic field is updated during `PLACE_SHARE`."""
+
 PLACE_SHARE = 3 * SECOND // 2
-"""In so many ns of so many, by their stamps alone, epochs tell where the Earth's magnetic field is looked up."""
+"""ns; time from the beginning of each period during which point solutions update the place."""
 
 NORMAL = (Status.USABLE, Status.OTHER_SIGNAL)
+"""Statuses that are no fault."""
 
 FAULTS = {
     Fault.NON_FINITE: "a parameter of orbit or clock is missing or not finite",
     Fault.BAD_VALUE: "a parameter of orbit or clock is none that a satellite can have",
 }
+"""What is wrong with an ephemeris, in words."""
 
 
 Key = TypeVar("Key")
 
 
 def place_of(solution: PointSolution) -> tuple[float, float, float] | None:
-    """Where an epoch was solved: latitude and longitude (deg), altitude (m)."""
+    """Return latitude and longitude (deg) and altitude (m) of a point solution; None if it was not solved."""
     if solution.status != SolutionStatus.SOLVED:
         return None
     latitude, longitude, altitude = solution.geodetic
@@ -98,18 +103,18 @@ def place_of(solution: PointSolution) -> tuple[float, float, float] | None:
 
 
 class RangeIntake:
-    """Turns clouds into epochs of signals and gives them to a navigator.
+    """Turns point clouds into epochs of signals and gives them to a navigator.
 
     Attributes:
         epochs: epochs that were read.
         solved: epochs of which a point solution was made.
         refused: messages and parts of them that could not be used, by reason.
         notes: what was left out of the files of ``ranges.rinex_nav_files``.
-        wants_solution: make a point solution of every epoch, in mode tight too.
+        wants_solution: make a point solution of every epoch, in mode tight, too.
     """
 
     def __init__(self, navigator: Navigator, parameters: Parameters) -> None:
-        """Raises RinexError when a file of ``ranges.rinex_nav_files`` cannot be read."""
+        """Prepare the intake; read the files of ``ranges.rinex_nav_files``. Raises RinexError if one cannot be read."""
         self._navigator = navigator
         self.configure(parameters)
         files = read_navigation_files([Path(name) for name in parameters.ranges.rinex_nav_files.split(":") if name])
@@ -133,7 +138,7 @@ class RangeIntake:
         self.wants_solution = False
 
     def configure(self, parameters: Parameters) -> None:
-        """Use other masks from now on: what can change while the node runs."""
+        """Use other masks and offsets from now on: those that can change while the node runs."""
         ranges = parameters.ranges
         self._solves = parameters.mode == "loose" and ranges.use_point_solution
         self._masks = Masks(HORIZON, ranges.cn0_mask)
@@ -143,7 +148,7 @@ class RangeIntake:
         self._time_offset = round(ranges.time_offset * SECOND)
 
     def take_ephemerides(self, stamp: int, points: NDArray[Any], arrival: int = 0) -> None:
-        """Add the points of a message of `gnss/ephemerides`; `DatedEphemerides` says which ranges they serve."""
+        """Add the points of a message of `gnss/ephemerides`; `DatedEphemerides` decides which ranges they serve."""
         try:
             read = read_ephemerides(points)
         except CloudError as error:
@@ -159,7 +164,10 @@ class RangeIntake:
             self._knows_ionosphere = self._knows_ionosphere or bool(KLOBUCHAR_SOURCES & read.klobuchar.keys())
 
     def take_ranges(self, stamp: int, points: NDArray[Any], arrival: int = 0) -> PointSolution | None:
-        """Give the points of a message of `gnss/ranges` to the navigator; return the point solution if one was made."""
+        """Give the points of a message of `gnss/ranges` to the navigator; return the point solution if one was made.
+
+        ``stamp`` and ``arrival`` in ns.
+        """
         try:
             epoch = read_epoch(points)
         except CloudError as error:
@@ -198,7 +206,7 @@ class RangeIntake:
         return ephemerides, stand_in if np.isnan(klobuchar).any() else klobuchar
 
     def _solution(self, epoch: Epoch, ephemerides: Ephemerides, klobuchar: NDArray[np.float64]) -> PointSolution:
-        """Solve the epoch alone, as a receiver would; from nothing, so that the order of epochs leaves no trace."""
+        """Solve the epoch alone, as a receiver would, from no prior position: the order of epochs has no influence."""
         locate(epoch.ranges, epoch.week, epoch.seconds, ephemerides)
         ranges = one_per_satellite(epoch.ranges, self._masks.cn0)
         solution = solve(ranges, epoch.week, epoch.seconds, klobuchar, self._point_settings)
@@ -225,19 +233,19 @@ class RangeIntake:
             self._navigator.push_gnss_velocity(stamp, velocity, covariance, arrival, from_ranges=True)
 
     def _note_message(self, refused: Mapping[str, int]) -> None:
-        """Take note of a message of either topic: what of it could not be used, by reason."""
+        """Count what could not be used of a message of either topic, by reason."""
         self.refused.update(refused)
         self._recently_refused.append(Counter(refused))
 
     @property
     def complaints(self) -> list[str]:
-        """What was wrong with the messages from the first to the last, one sentence each with what to do."""
+        """One sentence for each fault of the messages from the first to the last, with what to do."""
         refused = [f"{count} times: {reason}" for reason, count in self.refused.items()]
         return [*self.notes, *refused, *self._ionosphere_complaints(), *blamed(self._navigator.range_statuses)]
 
     @property
     def recent_complaints(self) -> list[str]:
-        """What is wrong with the messages at the moment: judged by the last `RECENT` of them, whatever came before."""
+        """One sentence for each present fault of the messages, judged by the last `RECENT` of them."""
         messages = len(self._recently_refused)
         refused = [
             f"{reason} ({count} in the last {messages} messages of ranges and ephemerides)"
@@ -252,7 +260,10 @@ class RangeIntake:
 
 
 def blamed(statuses: Mapping[Status, int], which: str = "") -> list[str]:
-    """Say why most signals cannot be used, if so, and what to do; ``which``: signals these are."""
+    """Return one sentence for each reason why most signals cannot be used, with what to do.
+
+    ``which``: words before the number of signals.
+    """
     total = sum(statuses.values()) - statuses.get(Status.OTHER_SIGNAL, 0)
     found = []
     for status, count in statuses.items():
@@ -263,7 +274,7 @@ def blamed(statuses: Mapping[Status, int], which: str = "") -> list[str]:
 
 
 def added(counts: Iterable[Counter[Key]]) -> Counter[Key]:
-    """Add up counts."""
+    """Return the sum of counters."""
     total: Counter[Key] = Counter()
     for one in counts:
         total.update(one)
@@ -271,12 +282,12 @@ def added(counts: Iterable[Counter[Key]]) -> Counter[Key]:
 
 
 def faults_of(records: NDArray[np.void]) -> Counter[str]:
-    """Count the ephemerides (EPHEMERIS) that no satellite will be placed by, by what is wrong with them."""
+    """Count the ephemerides (EPHEMERIS) that place no satellite, by what is wrong with them."""
     return Counter(FAULTS[Fault(fault)] for fault in check(records).tolist() if fault != Fault.NONE)
 
 
 def compile_ranges(parameters: Parameters) -> None:
-    """Compile all that a `RangeIntake` calls, or load it from the cache, with an epoch of five satellites."""
+    """Compile all that a `RangeIntake` calls, or load it from the cache, by an epoch of five satellites."""
     parameters = replace(parameters, ranges=replace(parameters.ranges, rinex_nav_files=""))
     trial = RangeIntake(Navigator(parameters), parameters)
     trial.wants_solution = True

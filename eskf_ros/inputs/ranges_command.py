@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 arguments.frame,
                 arguments.satellites,
             )
-            # A folder of its own for the file while it is incomplete: an interrupted run leaves an older one as it was.
+            # The incomplete file is in a folder of its own: an interrupted run leaves an older file as it was.
             with tempfile.TemporaryDirectory(prefix=".eskf_ranges-", dir=out.parent) as folder:
                 skipped = _write(Path(folder) / out.name, reader, beside)
                 os.replace(Path(folder) / out.name, out)
@@ -94,7 +94,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _write(path: Path, reader: BagReader, beside: Beside) -> list[str]:
-    """Copy the recording and add the messages; returns what was left out, one line each."""
+    """Copy the recording and add the messages; return what was left out, one line each."""
     slash = "/" if any(topic.startswith("/") for topic in reader.topics) else ""
     added = {slash + RANGES: beside.ranges, slash + EPHEMERIDES: beside.ephemerides}
     for topic in added:

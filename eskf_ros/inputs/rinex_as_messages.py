@@ -16,21 +16,22 @@ from eskf_ros.gnss.range_files import read_navigation_files, read_range_file
 from eskf_ros.gnss.ranges import locate
 
 MARGIN = 1_000_000_000
-"""ns around the recording in which epochs still belong to it."""
+"""ns; epochs this far outside of the recording still belong to it."""
 LEAD = 1_000_000
-"""ns from the ephemerides to the first epoch, by log time."""
+"""ns; log time from the ephemerides to the first epoch."""
 AGE = 60_000_000_000
-"""ns from the ephemerides to the first epoch, by stamp: as if a receiver had been on for a while, and knew them."""
+"""ns; time from the stamps of the ephemerides to the first epoch, as if the receiver had been on for a while."""
 EPHEMERIDES_PER_MESSAGE = 500
+"""Ephemerides in one message, at most."""
 
 
 class RangesError(Exception):
-    """Files and recording do not go together; the text is one line for the user."""
+    """The files do not fit the recording; the text is one line for the user."""
 
 
 @dataclass
 class Beside:
-    """The messages of RINEX files. ``outside``: epochs that are not of the recording's time; ``notes`` for the user."""
+    """The messages of RINEX files. ``outside``: epochs outside of the time of the recording; ``notes`` for the user."""
 
     ranges: Batch
     ephemerides: Batch
@@ -50,8 +51,8 @@ def read_beside(
     """Return the messages for a recording from ``first`` to ``last`` (ns of its clock).
 
     ``clock_offset`` (s): see `range_files.read_range_file`. With ``satellites`` the ranges bring the states of their
-    satellites; those without ephemeris are left plain. The log time of an epoch is its stamp; ephemerides come
-    before the first one. Raises RinexError for files that cannot be read, RangesError when no epoch is in that time.
+    satellites; those without ephemeris have none. The log time of an epoch is its stamp; ephemerides come before the
+    first one. Raises RinexError for files that cannot be read, RangesError if no epoch is in that time.
     """
     file = read_range_file(observations, clock_offset)
     files = read_navigation_files(navigation)
@@ -95,7 +96,7 @@ def read_beside(
 def merged(batches: Iterable[dict[str, Batch]], beside: Mapping[str, Batch]) -> Iterator[dict[str, Batch]]:
     """Add the messages ``beside`` a recording (by topic, sorted by log time) to its batches, each in its time.
 
-    What is older than a batch ends comes with it, the rest after the last one; so batches still follow each other
+    A message comes with the first batch that ends after it, or after the last batch; so batches still follow each other
     without overlap.
     """
     done = dict.fromkeys(beside, 0)

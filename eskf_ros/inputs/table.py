@@ -1,12 +1,12 @@
-"""The inputs of the estimator but for the IMU: one row each, for the node and for the replay alike.
+"""The inputs of the estimator other than the IMU: one row each, for node and replay alike.
 
-Both read serialised messages into batches (`eskf_ros.bags`), a recording by the thousand and the node one by one; from
-there on they share what is here, so that they give the estimator the same numbers, bit for bit.
+Both read serialised messages into batches (`eskf_ros.bags`), a recording by the thousand and the node one by one. From
+there on they share this file, so that they give the estimator the same numbers, bit for bit.
 
-A new input is a row of `INPUTS`, a function that makes arguments of its messages, and the parameter ``topics.NAME``; in
-the estimator it is a `Stream`, its `Intake` (`filter.settings`), a file in `filter.aiding` and the line in
-`filter.fusion.linearize` that calls it. A message type that is not there yet is a row of
-`bags.messages.MESSAGE_TYPES`. A second type for the same thing is an entry in ``others`` and a choice of the parameter
+A sensor that sends values with covariances needs no line here: its input is made of the row of its measurement
+(`filter.measurements.row.Row`; see `docs/add_a_measurement.md`). Other inputs are rows of `INPUTS`, with a function
+that turns messages into the arguments of a push. A message type that is not there yet is a row of
+`bags.messages.MESSAGE_TYPES`. A second type for the same input is an entry in ``others`` and a choice of the parameter
 ``topics.NAME_type``.
 """
 
@@ -41,15 +41,14 @@ ODOMETRY = wheel.ROW.types[0]
 
 @dataclass(frozen=True)
 class Input:
-    """One kind of input: the parameter ``topics.NAME``, its stream, the message type.
+    """One input: the parameter ``topics.NAME``, its stream, the message type.
 
-    ``arguments`` turns a batch into those of the push of this stream, one tuple per message that begins with the stamp
-    (ns). ``others``: further types that say the same, with what makes arguments of them. ``push``: the method of
-    `Navigator`, or of `RangeIntake`, that takes the arguments; empty: `Navigator.push`, with the stream. ``is_gnss``:
-    withheld in an outage.
-    ``by_receiver``: two receivers may share the topic, told apart by the frame. ``depth``: messages that may wait in
-    the node while the computer is busy elsewhere, a second of a fast sensor. ``is_timed``: its stamps are instants of
-    measurements.
+    ``arguments`` turns a batch into the arguments of the push of this stream: one tuple per message, which begins with
+    the stamp (ns). ``others``: further message types for the same input, each with its converter. ``push``: the method
+    of `Navigator`, or of `RangeIntake`, that takes the arguments; empty: `Navigator.push`, with the stream.
+    ``is_gnss``: withheld in a simulated outage. ``by_receiver``: two receivers may share the topic, told apart by the
+    frame. ``depth``: messages that may wait in the node while the computer is busy elsewhere, a second of a fast
+    sensor. ``is_timed``: its stamps are instants of measurements.
     """
 
     name: str
@@ -65,16 +64,16 @@ class Input:
 
     @property
     def types(self) -> tuple[str, ...]:
-        """All message types it can be, the usual one first."""
+        """All its message types, the usual one first."""
         return (self.type, *(name for name, _ in self.others))
 
     def of_type(self, name: str) -> Input:
-        """The same input, read from messages of another of its types."""
+        """Return the same input, read from messages of another of its types."""
         converters = {self.type: self.arguments, **dict(self.others)}
         return dataclasses.replace(self, type=name, arguments=converters[name], others=())
 
     def push_of(self, navigator: Navigator, intake: RangeIntake | None = None) -> Callable[..., Any]:
-        """What takes the arguments: the navigator, or for ranges and ephemerides their intake."""
+        """Return what takes the arguments: a method of the navigator, or of the intake of ranges and ephemerides."""
         if not self.push:
             return partial(navigator.push, self.stream)
         taker: Callable[..., Any] = getattr(intake if self.name in RANGES else navigator, self.push)
@@ -82,7 +81,7 @@ class Input:
 
 
 def _listed(column: NDArray[Any]) -> list[Any]:
-    """Numbers as Python numbers, vectors as arrays."""
+    """Return numbers as Python numbers, vectors as arrays."""
     return column.tolist() if column.ndim == 1 else list(np.ascontiguousarray(column))
 
 
@@ -106,13 +105,13 @@ def _gnss_velocities(batch: Batch) -> Arguments:
 
 
 def _vectors(batch: Batch, values: NDArray[Any], covariances: NDArray[Any]) -> Arguments:
-    """Arguments of `Navigator.push` from values (n, 3) and covariances (n, 9)."""
+    """Return the arguments of `Navigator.push` for values (n, 3) and covariances (n, 9)."""
     columns = _listed(batch.messages["stamp"]), _listed(values), _listed(covariances)
     return zip(*columns, batch.log_time.tolist(), strict=True)
 
 
 def _of_row(row: Row) -> Input:
-    """The input of a sensor that says of itself how its messages are read."""
+    """Return the input of a sensor whose row says how its messages are read."""
 
     def arguments(batch: Batch) -> Arguments:
         assert row.read is not None
@@ -153,16 +152,16 @@ INPUTS = (
     Input("ephemerides", Stream.PSEUDORANGE, POINT_CLOUD, _clouds, push="take_ephemerides", depth=50, is_timed=False),
     Input("ranges", Stream.PSEUDORANGE, POINT_CLOUD, _clouds, push="take_ranges", is_gnss=True, depth=50),
 )
-"""All but the IMU. The order is that of messages with one log time."""
+"""All inputs but the IMU. Messages with the same log time come in this order."""
 
 FIXES = ("gnss_fix", "gnss_velocity")
 RANGES = ("ranges", "ephemerides")
 
 
 def inputs_of(parameters: Parameters) -> tuple[Input, ...]:
-    """The rows in use: what a receiver solved or its ranges; beside ranges the fixes of a second receiver, if any.
+    """Return the inputs in use: the solutions of a receiver, or its ranges and the solutions of a second receiver.
 
-    What the first receiver solved comes on the same topics as that of the second: the navigator refuses it.
+    The solutions of the first receiver come on the same topics as those of the second: the navigator refuses them.
     """
     unused: tuple[str, ...] = RANGES
     if uses_ranges(parameters):
@@ -171,12 +170,12 @@ def inputs_of(parameters: Parameters) -> tuple[Input, ...]:
 
 
 def uses_ranges(parameters: Parameters) -> bool:
-    """Whether the first receiver is used by its ranges."""
+    """Return whether the ranges of the first receiver are used instead of its solutions."""
     return parameters.mode == "tight" or parameters.ranges.use_point_solution
 
 
 def time_offset_of(kind: Input, parameters: Parameters) -> float:
-    """What is added to the stamps of an input (s)."""
+    """Return the time offset (s) that is added to the stamps of an input."""
     group = "gnss" if kind.name in FIXES else "ranges" if kind.name in RANGES else kind.name
     offset: float = getattr(parameters, group).time_offset
     return offset

@@ -1,1 +1,1 @@
-"""The parameters: names, units, defaults, ranges and what they mean. `tree.py` holds them all."""
+"""The parameters: names, units, defaults, ranges and descriptions. `tree.py` holds them all."""

@@ -1,4 +1,4 @@
-"""``python -m eskf_ros.parameters``: write the files that follow from the parameters."""
+"""``python -m eskf_ros.parameters``: write the files that are generated from the parameters."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""`config/eskf.yaml` and `docs/parameters.md`, written from the parameters."""
+"""`config/eskf.yaml` and `docs/parameters.md`, generated from the parameters."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from eskf_ros.parameters.tree import Parameters
 
 
 def to_yaml(parameters: Parameters | None = None) -> str:
-    """A commented ROS parameter file with the given values (default: the defaults; that text is config/eskf.yaml)."""
+    """Return a commented ROS parameter file with the given values (default: the text of config/eskf.yaml)."""
     lines = [
         "# Parameters of eskf_ros with their defaults. Copy the file, keep the lines you change.",
         "# Written from eskf_ros/parameters by `python -m eskf_ros.parameters`.",
@@ -44,7 +44,7 @@ def _yaml_group(group: type, prefix: str, parameters: Parameters, lines: list[st
             lines += textwrap.wrap(text, 116, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ")
         value = value_of(parameters, name)
         if value == ():
-            # ROS makes an empty list a parameter without a type, which no node can declare: show the form only.
+            # ROS makes an empty list a parameter without a type, which no node can declare: write it as a comment.
             lines.append(f"{indent}# {item.name}: {_yaml_value((0.0,) * max(leaf.rule.lengths))}")
         else:
             lines.append(f"{indent}{item.name}: {_yaml_value(value)}")
@@ -66,7 +66,7 @@ def _yaml_value(value: Value) -> str:
 
 
 def to_markdown() -> str:
-    """The reference of all parameters; that text is docs/parameters.md."""
+    """Return the reference of all parameters, the text of docs/parameters.md."""
     lines = [
         "# Parameters",
         "",
@@ -96,7 +96,7 @@ def _markdown_table(members: list[Leaf]) -> list[str]:
 
 
 def main() -> int:
-    """Write config/eskf.yaml and docs/parameters.md of the checkout this module lies in; returns the exit code."""
+    """Write config/eskf.yaml and docs/parameters.md of the checkout with this module; return the exit code."""
     root = Path(__file__).resolve().parents[2]
     if not (root / "setup.py").is_file():
         print(f"{root} is no checkout of eskf_ros: run this where the sources are", file=sys.stderr)

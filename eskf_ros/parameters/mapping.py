@@ -1,4 +1,4 @@
-"""Parameters from mappings of names and values, every mistake a sentence, and back."""
+"""Parameters from mappings of names and values and back; every mistake is reported as a sentence."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ class Leaf:
 
     @property
     def kind(self) -> str:
-        """float, integer, bool, string or float list."""
+        """One of float, integer, bool, string, float list."""
         kinds = {bool: "bool", int: "integer", str: "string", tuple: "float list"}
         return kinds.get(type(self.default), "float")
 
     def allowed(self) -> str:
-        """What may be written for this parameter, as it appears in errors and in the documentation."""
+        """Return the allowed values of this parameter in words, for errors and the documentation."""
         rule = self.rule
         if self.kind == "bool":
             return "true or false"
@@ -53,7 +53,7 @@ class Leaf:
         return f"{noun} {bounds}{' or .nan' if rule.nan_allowed else ''}"
 
     def convert(self, value: object) -> Value:
-        """The checked value in the type of this parameter; integers become floats where a float is wanted.
+        """Return the checked value in the type of this parameter; integers become floats if a float is expected.
 
         Raises ValueError naming the key, the value and what is allowed.
         """
@@ -84,7 +84,7 @@ class Leaf:
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             return None
         if value != value:  # NaN; math.isnan fails for integers beyond the range of floats
-            # One object for all: equal `to_mapping` then means equal parameters.
+            # Always the same NaN object, so that equal parameters have equal `to_mapping`.
             return math.nan if self.rule.nan_allowed else None
         rule = self.rule
         minimum = rule.minimum[index] if isinstance(rule.minimum, tuple) else rule.minimum
@@ -99,7 +99,7 @@ class Leaf:
 
 
 def leaves() -> tuple[Leaf, ...]:
-    """All parameters in the order of the file."""
+    """Return all parameters in the order of the file."""
     return tuple(_leaves(Parameters, ""))
 
 
@@ -112,11 +112,12 @@ def _leaves(group: type, prefix: str) -> Iterator[Leaf]:
 
 
 def to_mapping(parameters: Parameters) -> dict[str, Value]:
-    """Dotted name -> value of every parameter."""
+    """Return the value of every parameter by dotted name."""
     return {leaf.name: value_of(parameters, leaf.name) for leaf in leaves()}
 
 
 def value_of(parameters: Parameters, name: str) -> Any:
+    """Return the value of the parameter with a dotted name."""
     value: Any = parameters
     for part in name.split("."):
         value = getattr(value, part)
@@ -124,10 +125,10 @@ def value_of(parameters: Parameters, name: str) -> Any:
 
 
 def from_mapping(mapping: Mapping[str, object], source: str = "parameters") -> Parameters:
-    """Parameters from nested mappings or dotted keys (or both mixed); what is not given keeps its default.
+    """Return the parameters of nested mappings or dotted keys (or both mixed); missing ones keep their defaults.
 
-    `source` is named in errors, usually the file. Raises ParameterError listing every unknown key, wrong type and
-    value outside its range.
+    `source` is named in errors, usually the file. Raises ParameterError listing every unknown key, wrong type and value
+    outside its range.
     """
     known = {leaf.name: leaf for leaf in leaves()}
     problems: list[str] = []
@@ -147,6 +148,7 @@ def from_mapping(mapping: Mapping[str, object], source: str = "parameters") -> P
 
 
 def flat(mapping: Mapping[str, object], source: str) -> dict[str, object]:
+    """Return values by dotted name; raises ParameterError if one is given twice."""
     values: dict[str, object] = {}
     problems: list[str] = []
     for name, value in _flatten(mapping, ""):

@@ -1,4 +1,4 @@
-"""The parameter files of ROS 2: sections by node names, wildcards, typed values."""
+"""Parameter files of ROS 2: sections by node names, wildcards, typed values."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ _RosLoader.add_implicit_resolver(
 
 
 def load(path: Path, node_name: str = "eskf_node") -> Parameters:
-    """Parameters from a ROS 2 parameter file.
+    """Return the parameters of a ROS 2 parameter file.
 
     Sections apply as in ROS: `/**`, `/*`, `eskf_node`, `/robot/eskf_node`, or nested namespaces; sections of other
-    nodes are ignored; where several apply, the later one in the file wins. A `node_name` without a leading slash
-    stands for the node in whatever single namespace the file uses.
+    nodes are ignored; if several apply, the later one in the file wins. A `node_name` without a leading slash stands
+    for the node in any single namespace that the file uses.
 
-    Raises ParameterError (naming the file and everything wrong in it) for a file that cannot be read, is no YAML,
-    has no section for this node, or fails `from_mapping`.
+    Raises ParameterError (naming the file and every mistake in it) for a file that cannot be read, is no YAML, has no
+    section for this node, or fails `from_mapping`.
     """
     source = str(path)
     try:
@@ -89,6 +89,6 @@ def _applies(section: str, node_name: str) -> bool:
         return re.fullmatch(pattern, node_name) is not None
     if "*" not in section:
         return section.rpartition("/")[2] == node_name
-    # The namespace is not known here: a pattern applies when there is a namespace in which it would.
+    # The namespace is unknown here: a pattern applies if it matches in some namespace.
     last = section.rpartition("/")[2]
     return last in (node_name, "*", "**")

@@ -1,4 +1,4 @@
-"""What a parameter is: default, unit, description, limits. The groups of parameters are dataclasses of these."""
+"""Definition of a parameter: default, unit, description, limits. Groups of parameters are dataclasses of these."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ Value = float | int | bool | str | tuple[float, ...]
 
 
 class ParameterError(ValueError):
-    """A parameter file or mapping that cannot be used; `problems` holds one complete sentence per mistake."""
+    """A parameter file or mapping cannot be used; `problems` holds one complete sentence per mistake."""
 
     def __init__(self, source: str, problems: list[str]) -> None:
         self.problems = tuple(problems)
@@ -19,11 +19,11 @@ class ParameterError(ValueError):
 
 @dataclass(frozen=True)
 class Rule:
-    """What is allowed for one parameter and how it is explained; kept as the metadata of its dataclass field.
+    """Limits and description of one parameter; kept as the metadata of its dataclass field.
 
-    `minimum` and `maximum` are inclusive, `above` and `below` are exclusive bounds. For lists a tuple gives one
-    bound per element. `lengths` are the allowed numbers of elements. `pattern` is a regular expression for strings,
-    explained by `pattern_text`. `live` parameters may change while the node runs, all others are read-only.
+    `minimum` and `maximum` are inclusive, `above` and `below` are exclusive bounds. For lists a tuple gives one bound
+    per element. `lengths` are the allowed numbers of elements. `pattern` is a regular expression for strings, explained
+    by `pattern_text`. `live` parameters may change while the node runs, all others are read-only.
     """
 
     default: Value
@@ -41,35 +41,41 @@ class Rule:
 
 
 def parameter(default: Value, unit: str, description: str, **limits: Any) -> Any:
+    """Return a dataclass field with a `Rule`; a tuple must have the length of the default unless `lengths` is given."""
     if isinstance(default, tuple) and "lengths" not in limits:
         limits["lengths"] = (len(default),)
     return dataclasses.field(default=default, metadata={"rule": Rule(default, unit, description, **limits)})
 
 
 def group_of(group: type, description: str) -> Any:
+    """Return a dataclass field that holds a group of parameters."""
     return dataclasses.field(default_factory=group, metadata={"group": group, "description": description})
 
 
 def choice(default: str, description: str, *others: str) -> Any:
+    """Return a dataclass field for one of several words; the first is the default."""
     words = (default, *others)
     return parameter(default, "", description, pattern="|".join(words), pattern_text=" or ".join(words))
 
 
 FRAME_NAME = {"pattern": r"[^/\s]\S*", "pattern_text": "a frame name without blanks and without a leading slash"}
+"""Limits of a parameter that names a frame."""
 
 TOPIC_NAME = {
     "pattern": r"(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*",
     "pattern_text": "a ROS topic name like imu/data or /robot/imu",
 }
+"""Limits of a parameter that names a topic."""
 
 TYPE_OF_TOPIC = (
     "Message type of this topic, where the driver publishes another one. The replay takes what was recorded."
 )
+"""Description of the parameters ``topics.NAME_type``."""
 
 
 @dataclass(frozen=True)
 class Aid:
-    """What every aid has: the fields of its group begin with these."""
+    """Parameters that every sensor has: the fields of its group begin with these."""
 
     use: bool = parameter(True, "", "Fuse the messages of this topic.", live=True)
     time_offset: float = parameter(

@@ -1,8 +1,8 @@
-"""The parameters of eskf_ros: names, units, defaults, ranges and what they mean.
+"""The parameters of eskf_ros: names, units, defaults, ranges and descriptions.
 
-The dataclasses below, and those in the files of the measurements (`filter.rows`), are the only places where a
-parameter is defined. `config/eskf.yaml` and `docs/parameters.md` are written from them by
-`python -m eskf_ros.parameters`, and `ros_yaml.load` reads the ROS 2 parameter files users write.
+The dataclasses below, and those in the files of the measurements (`filter.rows`), are the only places where a parameter
+is defined. `python -m eskf_ros.parameters` generates `config/eskf.yaml` and `docs/parameters.md` from them, and
+`ros_yaml.load` reads the ROS 2 parameter files of users.
 
 Values are Python floats, integers, bools, strings and tuples of floats. Angles whose name ends in `_deg` are degrees,
 all others are in the SI unit stated with them. Nothing here imports ROS.

@@ -1,1 +1,1 @@
-"""`eskf_replay`: recordings through the estimator. `run.py` is the loop, the other files are its two ends."""
+"""`eskf_replay`: recordings through the estimator. `run.py` is the loop; the other files are its input and output."""

@@ -1,4 +1,4 @@
-"""The messages of a recording on their way into the estimator: in which order, and which are withheld."""
+"""Feed of a replay: in which order the messages of a recording enter the estimator, and which are withheld."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from eskf_ros.inputs.table import Input
 from eskf_ros.replay.topics import TopicNames
 
 LARGEST_PUSH = 1024
-"""IMU samples given to the estimator at once when no other message lies between them."""
+"""IMU samples given to the estimator at once, at most, if no other message lies between them."""
 LOOK_AHEAD = 10_000_000_000
-"""ns of log time within which messages are put into the order of their stamps."""
+"""ns of log time within which messages are sorted by stamp."""
 
 Offer = tuple[int, Input, tuple[Any, ...]]
-"""A message: how many IMU samples of the batch come before it, what it is, the arguments of the push."""
+"""A message: how many IMU samples of the batch come before it, its input, and the arguments of the push."""
 
 
 class Feed:
@@ -34,7 +34,7 @@ class Feed:
     Attributes:
         first_stamp: ns, the earliest IMU stamp of the first batch that has IMU samples.
         imu_count: IMU samples offered.
-        withheld: how many messages were not offered, by input.
+        withheld: number of messages that were not offered, by input.
     """
 
     def __init__(
@@ -58,11 +58,11 @@ class Feed:
         self._pushes = {kind.name: kind.push_of(navigator, intake) for kind in topics.inputs}
 
     def ordered(self, batches: Iterable[dict[str, Batch]]) -> Iterable[dict[str, Batch]]:
-        """The batches as they have to be pushed."""
+        """Return the batches in the order in which they have to be pushed."""
         return in_stamp_order(batches) if self._by_stamp else batches
 
     def push(self, batch: dict[str, Batch]) -> NDArray[Any]:
-        """Offer the messages of a batch; returns the ODOMETRY rows of its IMU samples, (n,)."""
+        """Offer the messages of a batch; return the ODOMETRY rows of its IMU samples, (n,)."""
         rows: list[NDArray[Any]] = []
         imu = batch.get(self._topics.imu)
         if imu is not None:
@@ -92,7 +92,7 @@ class Feed:
                 self._pushes[kind.name](*arguments)
         if imu is not None:
             push_imu_until(len(stamps))
-        # As bytes: numpy copies structured arrays field by field and takes ten times as long.
+        # Joined as bytes: numpy copies structured arrays field by field, which takes ten times as long.
         return np.frombuffer(b"".join(part.data for part in rows), ODOMETRY)
 
     def _in_outage(self, stamp: int) -> bool:
@@ -107,7 +107,7 @@ class Feed:
         return batch.messages["stamp"] if self._by_stamp else batch.log_time
 
     def _offers(self, batch: dict[str, Batch]) -> list[Offer]:
-        """The messages of a batch, but for the IMU, in their order."""
+        """Return the messages of a batch other than the IMU, in their order."""
         imu = batch.get(self._topics.imu)
         imu_time = np.zeros(0, np.int64) if imu is None else self._time(imu)
         offers: list[tuple[int, Offer]] = []
@@ -124,10 +124,10 @@ class Feed:
 
 
 def in_stamp_order(batches: Iterable[dict[str, Batch]]) -> Iterator[dict[str, Batch]]:
-    """Batches in the order of stamps out of batches in the order of log time, with bounded memory.
+    """Yield batches in the order of stamps from batches in the order of log time, with bounded memory.
 
-    A message waits until the recording has been read for another `LOOK_AHEAD` of log time; one that was recorded even
-    later than that behind newer stamps comes late here too.
+    A message waits until the recording has been read for another `LOOK_AHEAD` of log time. One that was recorded later
+    than that behind newer stamps comes late here, too.
     """
     held: dict[str, Batch] = {}
     for batch in batches:

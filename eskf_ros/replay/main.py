@@ -1,6 +1,6 @@
 """The command `eskf_replay`: arguments, errors and exit codes, progress and the final table.
 
-Only what the arguments need is imported here; the estimator is imported when they are known to be right.
+Only the modules that the arguments need are imported here; the estimator is imported once they are known to be right.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ class _Mistake(Exception):
 class _Stopped(BaseException):
     """Ctrl-C or `kill`.
 
-    Not KeyboardInterrupt: one that passes an import of a dataclass makes Python die of SIGINT although it is caught.
+    It is not KeyboardInterrupt: one that passes through an import of a dataclass makes Python die of SIGINT although it
+    is caught.
     """
 
     def __init__(self, number: int) -> None:
@@ -164,7 +165,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit code: 0, 2 for what the user can mend, 130 after Ctrl-C, 143 after `kill`."""
+    """Run the command; return the exit code: 0, 2 for a mistake of the user, 130 after Ctrl-C, 143 after `kill`."""
     previous = [signal.signal(number, _stop) for number in _STOPPING]
     try:
         return _run(_parser().parse_args(arguments))
@@ -221,7 +222,7 @@ def _folder(bag: Path, out: Path | None) -> Path:
 
 
 def _replay(bag: Path, folder: Path, parameters: Parameters, options: argparse.Namespace) -> dict[str, Any]:
-    """Replay one recording and show the outcome; raises _Mistake."""
+    """Replay one recording and show the result; raises _Mistake."""
     started = time.perf_counter()
     from eskf_ros.bags import BagError
     from eskf_ros.replay.run import Options, replay
@@ -254,7 +255,7 @@ def _replay(bag: Path, folder: Path, parameters: Parameters, options: argparse.N
 
 @contextmanager
 def _progress(bag: Path, quiet: bool) -> Iterator[Callable[[float], None]]:
-    """A progress bar on the terminal, if there is one; what is compiled first is told in any case."""
+    """Show a progress bar if there is a terminal; report compiling in any case."""
     if quiet:
         yield lambda share: None
         return

@@ -1,4 +1,4 @@
-"""The files of one replay. They are written under temporary names and take their final names together at the end."""
+"""Result files of one replay: written under temporary names, renamed together at the end."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from eskf_ros.replay.tum_writer import tum_text
 NAMES = ("odometry.mcap", "trajectory.tum", "aids.csv", "summary.json")
 AIDS_HEADER = "stamp,arrival,aid,innovation_0,innovation_1,innovation_2,nis,dof,verdict,source\n"
 FIX_INTERVAL = 1_000_000_000
-"""ns between two NavSatFix messages in odometry.mcap."""
+"""ns; time between two NavSatFix messages in odometry.mcap."""
 
 RANGE_STREAMS = (Stream.PSEUDORANGE, Stream.RANGE_RATE)
 _signal_name = lru_cache(maxsize=1024)(name_of)
@@ -40,11 +40,11 @@ _COVARIANCE_KNOWN = 3
 
 
 class ResultFiles:
-    """Context manager: `write_summary` replaces the results of an earlier replay; without it nothing is left.
+    """Context manager: `write_summary` replaces the results of an earlier replay; without it no file is left.
 
-    Only files called as in `NAMES` are ever replaced. With `output_rate` above 0 (Hz) the rows are thinned to it, as
-    the navigator would: the first row at or after each multiple of the interval. Raises OSError or BagError when the
-    folder cannot be written. `seconds` is the time the writing thread has worked.
+    Only files with a name in `NAMES` are ever replaced. With `output_rate` above 0 (Hz) the rows are thinned to it, as
+    the navigator would: the first row at or after each multiple of the interval. Raises OSError or BagError if the
+    folder cannot be written. `seconds` is the working time of the writing thread.
     """
 
     def __init__(self, folder: Path, frames: Frames, output_rate: float = 0.0) -> None:
@@ -61,7 +61,7 @@ class ResultFiles:
         self._created = [place for place in (self.folder, *self.folder.parents) if not place.exists()]
         self.folder.mkdir(parents=True, exist_ok=True)
         try:
-            # A folder, not other names: odometry.mcap holds its own name.
+            # Temporary files have their final names, in a folder of their own: odometry.mcap contains its name.
             self._partial = Path(self._all.enter_context(TemporaryDirectory(prefix=".partial-", dir=self.folder)))
             self._all.enter_context(self._files)
             self._bag = self._files.enter_context(BagWriter(self._partial / "odometry.mcap"))
@@ -77,9 +77,9 @@ class ResultFiles:
         return self
 
     def write(self, rows: NDArray[Any], records: NDArray[Any], datum: tuple[float, float, float] | None) -> None:
-        """Append RECORD rows (m,) to aids.csv, and ODOMETRY rows (n,) whose position is known to the other two files.
+        """Append RECORD rows (m,) to aids.csv, and ODOMETRY rows (n,) with a known position to the other two files.
 
-        The work is done by a thread, mostly outside Python, while the estimator takes the next batch.
+        A thread does the work, mostly outside Python, while the estimator takes the next batch.
         """
         self._wait()
         self._writing = self._writer.submit(self._write, rows, records, datum)
@@ -105,14 +105,14 @@ class ResultFiles:
             self._writing.result()
 
     def finish(self) -> None:
-        """Complete all files but summary.json; nothing can be appended any more."""
+        """Complete all files but summary.json; nothing can be appended afterwards."""
         self._wait()
         began = time.perf_counter()
         self._files.close()
         self.seconds += time.perf_counter() - began
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
-        """Write summary.json, after `finish`, and give all files their names; what is NaN must have become None."""
+        """Write summary.json, after `finish`, and rename all files; a NaN in it must have been replaced by None."""
         text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
         (self._partial / "summary.json").write_text(text, encoding="utf-8")
         for name in NAMES:
@@ -128,12 +128,12 @@ class ResultFiles:
 
 
 def selected(rows: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[Any]:
-    """`rows[mask]`, without a copy when it is all of them: a row is more than a kilobyte."""
+    """Return `rows[mask]`, without a copy if the mask is all true: a row has more than a kilobyte."""
     return rows if mask.all() else rows[mask]
 
 
 def _first_in_each(stamps: NDArray[np.int64], last: int, interval: int) -> NDArray[np.bool_]:
-    """Which of the increasing `stamps` is the first at or after a multiple of `interval` (ns; 0: all of them).
+    """Return which of the increasing `stamps` is the first at or after a multiple of `interval` (ns; 0: all of them).
 
     `last` is the stamp before the first one.
     """
@@ -143,7 +143,7 @@ def _first_in_each(stamps: NDArray[np.int64], last: int, interval: int) -> NDArr
 
 
 def aids_lines(records: NDArray[Any]) -> str:
-    """Lines of aids.csv; stamps in seconds with nine decimals, numbers with all digits, nan where there is none.
+    """Return lines of aids.csv; stamps in seconds with nine decimals, numbers with all digits, nan for missing ones.
 
     The source is the signal of a range, else the number of the receiver.
     """
@@ -161,7 +161,7 @@ def aids_lines(records: NDArray[Any]) -> str:
 
 
 def odometry_messages(rows: NDArray[Any]) -> NDArray[Any]:
-    """nav_msgs/Odometry (n,) of ODOMETRY rows; strings 0 and 1 are the map frame and base_link."""
+    """Return nav_msgs/Odometry (n,) of ODOMETRY rows; strings 0 and 1 are the map frame and base_link."""
     messages = np.zeros(len(rows), message_dtype(ODOMETRY))
     messages["stamp"] = rows["stamp"]
     messages["child_frame_id"] = 1
@@ -175,7 +175,7 @@ def odometry_messages(rows: NDArray[Any]) -> NDArray[Any]:
 
 
 def fix_messages(rows: NDArray[Any], map_frame: MapFrame) -> NDArray[Any]:
-    """sensor_msgs/NavSatFix (n,) of base_link; string 1 is base_link."""
+    """Return sensor_msgs/NavSatFix (n,) of base_link; string 1 is base_link."""
     messages = np.zeros(len(rows), message_dtype(FIX))
     geodetic = to_geodetic(map_frame.to_ecef(rows["position_map"]))
     messages["stamp"] = rows["stamp"]

@@ -1,4 +1,4 @@
-"""One recording through the estimator: batches of messages in, result files and a summary out."""
+"""Replay of one recording: batches of messages in, result files and a summary out."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from eskf_ros.replay.topics import InputError, TopicNames, find_topics, truth_co
 from eskf_ros.replay.truth import TruthComparison
 
 TRUTH_RATE = 50.0
-"""Hz: rows for the comparison with truth are at least this dense, whatever the rate of the files."""
+"""Hz; least rate of the rows that are compared with truth, whatever the rate of the files."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """What the command line asks for. Outages are (start, length) in s from the first IMU stamp.
+    """The options of the command line. Outages are (start, length) in s from the first IMU stamp.
 
-    ``mode``: loose, tight, ins-only, or empty for that of the parameters, tight with a file of `ranges`. ``ranges``,
+    ``mode``: loose, tight, ins-only, or empty for that of the parameters (tight with a file of `ranges`). ``ranges``,
     ``navigation``: RINEX files beside the recording; ``clock_offset``: s by which its stamps are ahead of UTC.
     """
 
@@ -57,13 +57,13 @@ class StageClock:
         self._started = self._last = started
 
     def lap(self, stage: str) -> None:
-        """Count the time since the last call for `stage`."""
+        """Add the time since the last call to `stage`."""
         now = time.perf_counter()
         self.stages[stage] = self.stages.get(stage, 0.0) + now - self._last
         self._last = now
 
     def total(self) -> float:
-        """Seconds since the start."""
+        """Return the seconds since the start."""
         return time.perf_counter() - self._started
 
 
@@ -76,11 +76,11 @@ def replay(
 ) -> dict[str, Any]:
     """Replay `bag`, write the result files to `options.folder`, return the content of summary.json.
 
-    `progress` is called with the share of the recording that is done. Times count from `started` (time.perf_counter).
+    `progress` is called with the processed share of the recording. Times count from `started` (time.perf_counter).
 
     Raises:
-        BagError: the recording cannot be read, or a result not be written.
-        InputError: the recording lacks what is needed, or does not fit the options.
+        BagError: the recording cannot be read, or a result cannot be written.
+        InputError: the recording lacks a topic, or does not fit the options.
         OSError: the results cannot be written.
     """
     clock = StageClock(time.perf_counter() if started is None else started)
@@ -141,7 +141,7 @@ def replay(
 
 
 def with_options(parameters: Parameters, options: Options) -> Parameters:
-    """The parameters with what the options change in them."""
+    """Return the parameters as changed by the options."""
     mode = options.mode if options.mode in ("loose", "tight") else ""
     if not options.mode and options.ranges is not None and not parameters.ranges.use_point_solution:
         mode = "tight"
@@ -158,9 +158,9 @@ def with_options(parameters: Parameters, options: Options) -> Parameters:
 def open_ranges(
     navigator: Navigator, parameters: Parameters, options: Options, reader: BagReader, topics: TopicNames
 ) -> tuple[RangeIntake | None, Iterable[dict[str, Batch]]]:
-    """What takes the ranges, if there are any, and all messages of the recording and of the files beside it.
+    """Return the intake of ranges, if there are any, and all messages of the recording and of the files beside it.
 
-    Raises InputError when a file cannot be read or does not belong to the recording.
+    Raises InputError if a file cannot be read or does not belong to the recording.
     """
     batches = reader.batches(topics.wanted())
     named = {kind.name: topic for kind, topic in topics.inputs.items()}

@@ -1,23 +1,25 @@
-"""summary.json: what a replay found out, in numbers that are not rounded.
+"""summary.json: the results of a replay in numbers that are not rounded.
 
-Stamps are integer ns, lengths m, times s; what is not known is null.
+Stamps are integer ns, lengths m, times s; an unknown value is null.
 
-- `duration_s`: from the first to the newest IMU stamp; `imu_count`: samples offered; `imu`: what became of them.
-  `restarts`: how often the alignment started again; `position_resets`: how often fixes won over the filter.
-- `aids.{name}`: `offered` measurements by their final verdict: `fused` (weighed_down and reset too), `late`
+- `duration_s`: from the first to the newest IMU stamp; `imu_count`: samples offered; `imu`: counts of what became of
+  them. `restarts`: restarts of the alignment; `position_resets`: how often fixes won over the filter.
+- `aids.{name}`: `offered` measurements by their final verdict: `fused` (weighed_down and reset, too), `late`
   (outside_history), `rejected` (all other verdicts but waiting, which is for those newer than the last IMU sample); all
-  of them in `verdicts`. `withheld` measurements were not offered (--outage, --mode ins-only), null where they are
-  parts of epochs of ranges: those are counted whole, in `ranges`. `nis_mean` and `nis_in_95` are over all measurements
-  that were tested, the gated ones included.
-- `..._in_95`, `in_95`: share of the values not above the 95 % quantile of chi-square (ideal 0.95, cautious above).
+  of them in `verdicts`. `withheld` measurements were not offered (--outage, --mode ins-only); null for parts of epochs
+  of ranges, which are counted as epochs in `ranges`. `nis_mean` and `nis_in_95` are over all measurements that were
+  tested, the gated ones included.
+- `..._in_95`, `in_95`: share of the values not above the 95 % quantile of chi-square (ideal 0.95; above it the filter
+  is cautious).
 - `final`: the state at the newest IMU sample, `position` and `velocity` of base_link in map, `lla` deg deg m, `rpy_deg`
   about the local vertical, yaw 0 = east; biases in IMU axes.
 - `error`: absolute errors at the truth epochs from the first known position on, heading from the first known heading
-  on; of the antenna when the truth is a NavSatFix. `nees`: e' P^-1 e, 3 degrees of freedom, so its ideal mean is 3.
-- `ranges`: `epochs` read and epochs `withheld`, `signals` by `gnss.ranges.Status`, milliseconds the receiver's clock
-  jumped by, how often most satellites contradicted the state, which then was given the uncertainty they showed.
+  on; of the antenna if the truth is a NavSatFix. `nees`: e' P^-1 e, 3 degrees of freedom, so its ideal mean is 3.
+- `ranges`: `epochs` read and epochs `withheld`, `signals` by `gnss.ranges.Status`, `clock_jumps_ms`: milliseconds by
+  which the receiver clock jumped, `outvoted_states`: how often most satellites contradicted the state, whose variance
+  was then inflated.
 - `outages[]`: `distance` is the length of the estimated path; the errors are those at the last truth epoch within.
-- `timing`: `write` is the work of a thread beside the others, of which `wait` was waited for.
+- `timing`: `write` is the work of a parallel thread, `wait` the part of it that was waited for.
 """
 
 from __future__ import annotations
@@ -39,14 +41,14 @@ from eskf_ros.replay.topics import TopicNames
 from eskf_ros.replay.truth import rotation_matrices
 
 CHI_SQUARE_95 = np.array([math.nan, 3.841458820694124, 5.991464547107979, 7.814727903251179])
-"""95 % quantile of chi-square by degrees of freedom: `in_95` is the share of values not above it."""
+"""95 % quantile of chi-square by degrees of freedom."""
 MADE_OF_RANGES = (Stream.PSEUDORANGE, Stream.RANGE_RATE, Stream.GNSS_POSITION, Stream.GNSS_VELOCITY)
-"""What an epoch of ranges is offered as: its signals, or in mode loose its point solution."""
+"""Streams of an epoch of ranges: its signals or, in mode loose, its point solution."""
 OUTAGE_ERRORS = ("horizontal", "vertical", "heading_deg")
 
 
 class Summary:
-    """Collects rows and final records of one replay; what the feed withheld and offered is taken from `feed`.
+    """Collects rows and final records of one replay; `feed` counts what was withheld and offered.
 
     `outages` are (start, length) in s from the first IMU stamp.
     """
@@ -82,7 +84,7 @@ class Summary:
         return np.asarray((stamps - (self._feed.first_stamp or 0)) * 1e-9, np.float64)
 
     def result(self, navigator: Navigator, wall_s: float) -> dict[str, Any]:
-        """The part of the summary that every replay has."""
+        """Return the part of the summary that every replay has."""
         final = navigator.odometry[0]
         duration = (int(final["stamp"]) - self._feed.first_stamp) * 1e-9 if self._feed.first_stamp is not None else 0.0
         return {
@@ -99,12 +101,12 @@ class Summary:
         }
 
     def _aids(self) -> list[Stream]:
-        """The inputs of the recording, and the constraints that were ever active."""
+        """Return the streams of the inputs in the recording, and of the constraints that were ever active."""
         inputs = {kind.stream for kind in self._feed.withheld}
         return [stream for stream in Stream if stream in inputs or self._verdicts[stream].any()]
 
     def _withheld(self, stream: Stream) -> int | None:
-        """None where the messages are epochs of ranges: what would have been offered of them nobody has found out."""
+        """Return how many measurements were withheld; None for epochs of ranges, whose signals are not counted."""
         inputs = [kind for kind in self._feed.withheld if stream in streams_of(kind)]
         if any(kind.name == "ranges" for kind in inputs):
             return None
@@ -121,7 +123,7 @@ class Summary:
         }
 
     def outages(self, compared: NDArray[Any] | None) -> list[dict[str, Any]]:
-        """For each outage the length of the estimated path and, with truth, the errors at its last compared epoch."""
+        """Return for each outage the length of the estimated path and, with truth, the errors at its last epoch."""
         results = []
         for (start, length), distance in zip(self._outages, self._distances, strict=True):
             result: dict[str, Any] = {"start": start, "length": length, "distance": distance}
@@ -135,7 +137,7 @@ class Summary:
         return results
 
     def warnings(self, navigator: Navigator, topics: TopicNames, parameters: Parameters) -> list[str]:
-        """What the user should know, one line each."""
+        """Return the warnings for the user, one line each."""
         lines = navigator.complaints + navigator.notes
         if navigator.restarts:
             lines.append(
@@ -167,7 +169,7 @@ class Summary:
 
 
 def truth_result(topic: str, offered: int, compared: NDArray[Any]) -> dict[str, Any]:
-    """`truth`, `error` and `nees`: COMPARED rows (n,) out of `offered` truth epochs."""
+    """Return `truth`, `error` and `nees` of COMPARED rows (n,) out of `offered` truth epochs."""
     nees = {"position": compared["nees_position"], "attitude": compared["nees_attitude"]}
     return {
         "truth": {
@@ -182,14 +184,14 @@ def truth_result(topic: str, offered: int, compared: NDArray[Any]) -> dict[str, 
 
 
 def streams_of(kind: Input) -> tuple[Stream, ...]:
-    """Where in the records the measurements of an input are; ephemerides are none."""
+    """Return the streams of the records that an input leads to; none for ephemerides."""
     if not kind.is_timed:
         return ()
     return MADE_OF_RANGES if kind.name == "ranges" else (kind.stream,)
 
 
 def ranges_result(navigator: Navigator, intake: RangeIntake, feed: Feed) -> dict[str, Any]:
-    """`ranges`: what became of epochs and signals before the filter, and what the filter found out about the clock."""
+    """Return `ranges`: counts of epochs and signals before the filter, and faults of the receiver clock in it."""
     state = navigator.state[0]
     return {
         "ranges": {
@@ -220,7 +222,7 @@ def _consistency(values: NDArray[np.float64]) -> dict[str, float] | None:
 
 
 def counted(verdicts: NDArray[np.int64]) -> dict[str, int]:
-    """What became of the measurements of an aid, of counts by `Verdict`.
+    """Return the numbers of offered, fused, rejected and late measurements from counts by `Verdict`.
 
     `rejected` is every verdict but fused, waiting, and outside_history, which is `late`.
     """
@@ -231,12 +233,12 @@ def counted(verdicts: NDArray[np.int64]) -> dict[str, int]:
 
 
 def named(verdicts: NDArray[np.int64]) -> dict[str, int]:
-    """Counts by `Verdict` under its name, those that occur."""
+    """Return the counts by `Verdict` that are not zero, by name."""
     return {verdict.name.lower(): int(verdicts[verdict]) for verdict in Verdict if verdicts[verdict]}
 
 
 def final_result(row: NDArray[Any], datum: tuple[float, float, float] | None) -> dict[str, Any]:
-    """The last state, an ODOMETRY row; None for what is not known. Roll, pitch, yaw are about the local vertical."""
+    """Return the values of the last ODOMETRY row, None if unknown; roll, pitch, yaw are about the local vertical."""
     known = bool(row["position_known"]) and datum is not None
     result: dict[str, Any] = {
         "stamp": int(row["stamp"]),

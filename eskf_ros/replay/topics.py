@@ -1,4 +1,4 @@
-"""Which topics of a recording are replayed, and what is said when they are not there."""
+"""Topics of a recording that are replayed, and the messages to the user if they are missing."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ IMU = "sensor_msgs/msg/Imu"
 
 
 class InputError(Exception):
-    """A recording or an option that cannot be used; the text is one line for the user."""
+    """A recording or an option cannot be used; the text is one line for the user."""
 
 
 @dataclass(frozen=True)
 class TopicNames:
-    """Names as they are in the recording; empty: not there, or not wanted."""
+    """Names of topics in the recording; empty if missing or not wanted."""
 
     imu: str
     inputs: Mapping[Input, str]
     truth: str = ""
     truth_type: str = ""
     beside: frozenset[str] = frozenset()
-    """Topics that come out of other files than the recording."""
+    """Topics that come from other files than the recording."""
 
     def wanted(self) -> dict[str, str]:
-        """What to read: topic -> type."""
+        """Return the topics to read: topic -> type."""
         types = {self.imu: IMU}
         types |= {topic: kind.type for kind, topic in self.inputs.items() if topic not in self.beside}
         return types | ({self.truth: self.truth_type} if self.truth else {})
 
     def of(self, stream: Stream) -> str:
-        """The topic of a stream; empty if it has none."""
+        """Return the topic of a stream; empty if it has none."""
         return next((topic for kind, topic in self.inputs.items() if kind.stream == stream), "")
 
 
@@ -51,9 +51,9 @@ def find_topics(
 ) -> tuple[TopicNames, list[str]]:
     """Find the topics of the parameters, and the `truth` topic unless empty, in the recording.
 
-    All but the IMU and what GNSS is used by, fixes or ranges, may be missing as long as their names are the defaults;
-    with `has_range_file` the ranges come from there. Where an input can be of several types, the recording says which
-    it is. A list of hints says what else could be the GNSS velocity.
+    All but the IMU and the topic that GNSS is used by (fixes or ranges) may be missing as long as their names are the
+    defaults; with `has_range_file` the ranges come from there. If an input can have several types, the recording
+    decides. The returned hints name other topics that could be the GNSS velocity.
 
     Raises:
         InputError: another topic is missing, has no messages or the wrong type.
@@ -96,7 +96,7 @@ def _velocity_hint(reader: BagReader, names: Topics, inputs: Mapping[Input, str]
 
 
 def _find(reader: BagReader, name: str) -> str:
-    """The topic called `name`: as it stands, in the root namespace, or in the only namespace that has one; or empty."""
+    """Return the topic `name` as it stands, in the root namespace, or in the only namespace with it; or empty."""
     relative = name.removeprefix("~").strip("/")
     for candidate in (name, f"/{relative}", relative):
         if candidate in reader.topics:
@@ -122,9 +122,9 @@ def _require(reader: BagReader, bag: Path, name: str, types: tuple[str, ...], re
 
 
 def truth_converter(topics: TopicNames, bag: Path, parameters: Parameters) -> Callable[[Batch], NDArray[Any]]:
-    """What makes truth epochs of a batch of the truth topic.
+    """Return the function that turns a batch of the truth topic into truth epochs.
 
-    The result raises InputError for Odometry whose frame is neither `earth` nor the map frame of a configured datum.
+    The function raises InputError for Odometry whose frame is neither `earth` nor the map frame of a configured datum.
     """
 
     def from_odometry(batch: Batch) -> NDArray[Any]:

@@ -1,11 +1,11 @@
-"""The estimate against a reference trajectory: errors and consistency (NEES).
+"""Comparison of the estimate with a reference trajectory: errors and consistency (NEES).
 
 Truth arrives in blocks and is compared as soon as the estimate has passed it, so that memory holds a few seconds of
-both and then a few numbers per truth epoch. The estimate is interpolated between the two rows around a truth stamp;
-where these are further apart than `LARGEST_GAP` nothing is compared.
+both and then a few numbers per truth epoch. The estimate is interpolated between the two rows around a truth stamp; if
+these are further apart than `LARGEST_GAP`, nothing is compared.
 
-Positions are subtracted in Earth-centred axes and errors are given in East-North-Up at the estimate, so the figures
-do not depend on the distance to the datum.
+Positions are subtracted in Earth-centred axes and errors are given in East-North-Up at the estimate, so the figures do
+not depend on the distance to the datum.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from eskf_ros.geodesy.map_frame import MapFrame, east_north_up_to_ecef, to_geode
 Array = NDArray[np.float64]
 
 LARGEST_GAP = 100_000_000
-"""ns: the estimate is not interpolated over a longer interval."""
+"""ns; the estimate is not interpolated over a longer interval."""
 KEPT = 10_000_000_000
-"""ns: how long rows are kept for truth that is recorded later than its stamp says."""
+"""ns; rows are kept for this long, for truth that is recorded later than its stamp."""
 
 EPOCH = np.dtype(
     [
@@ -34,7 +34,7 @@ EPOCH = np.dtype(
         ("covariance_enu", "f8", (3, 3)),
     ]
 )
-"""One truth epoch; what its topic does not carry is NaN (rotation, speed) or zero (covariance)."""
+"""One truth epoch; missing values are NaN (rotation, speed) or zero (covariance)."""
 
 COMPARED = np.dtype(
     [
@@ -47,11 +47,11 @@ COMPARED = np.dtype(
         ("nees_attitude", "f8"),
     ]
 )
-"""One compared epoch: absolute errors (m, m, m/s, deg) and NEES; NaN where truth or estimate has no such value."""
+"""One compared epoch: absolute errors (m, m, m/s, deg) and NEES; NaN if truth or estimate has no such value."""
 
 
 def epochs_from_odometry(messages: NDArray[Any], map_frame: MapFrame | None) -> NDArray[Any]:
-    """Truth epochs of base_link from nav_msgs/Odometry (n,), given in `map_frame` or, when that is None, in ECEF."""
+    """Return truth epochs of base_link from nav_msgs/Odometry (n,) in `map_frame` or, if that is None, in ECEF."""
     epochs = np.zeros(len(messages), EPOCH)
     epochs["stamp"] = messages["stamp"]
     epochs["position_ecef"] = messages["position"]
@@ -64,7 +64,7 @@ def epochs_from_odometry(messages: NDArray[Any], map_frame: MapFrame | None) -> 
 
 
 def epochs_from_fix(messages: NDArray[Any]) -> NDArray[Any]:
-    """Truth epochs of the antenna from sensor_msgs/NavSatFix (n,): positions and covariances; status < 0 left out."""
+    """Return truth epochs of the antenna (position, covariance) from sensor_msgs/NavSatFix (n,) with a status >= 0."""
     messages = messages[messages["status"] >= 0]
     epochs = np.zeros(len(messages), EPOCH)
     geodetic = zip(
@@ -85,7 +85,7 @@ def epochs_from_fix(messages: NDArray[Any]) -> NDArray[Any]:
 class TruthComparison:
     """Compares rows of the estimate with truth epochs; both come in blocks, rows by increasing stamp.
 
-    `point_body` is what the truth is the position of, in base_link (m): zero, or the antenna for NavSatFix truth.
+    `point_body` is the point in base_link (m) whose position the truth is: zero, or the antenna for NavSatFix truth.
     """
 
     def __init__(self, point_body: tuple[float, ...] = (0.0, 0.0, 0.0)) -> None:
@@ -96,13 +96,13 @@ class TruthComparison:
         self.offered = 0
 
     def add_truth(self, epochs: NDArray[Any]) -> None:
-        """Take truth epochs (n,) `EPOCH`, in any order; those that are not finite are left out."""
+        """Add truth epochs (n,) `EPOCH`, in any order; those that are not finite are left out."""
         epochs = epochs[np.isfinite(epochs["position_ecef"]).all(axis=1)]
         self.offered += len(epochs)
         self._waiting = np.concatenate([self._waiting, epochs])
 
     def add_rows(self, rows: NDArray[Any], datum: tuple[float, float, float]) -> None:
-        """Take ODOMETRY rows (n,) whose position is known and compare the truth they have reached."""
+        """Add ODOMETRY rows (n,) with a known position, and compare the truth epochs that they have reached."""
         self._rows = rows if self._rows is None else np.concatenate([self._rows, rows])
         stamps = self._rows["stamp"]
         reached = self._waiting["stamp"] <= stamps[-1]
@@ -120,7 +120,7 @@ class TruthComparison:
         self._rows = self._rows[np.searchsorted(stamps, stamps[-1] - KEPT) :].copy()
 
     def compared(self) -> NDArray[Any]:
-        """All epochs compared so far, (n,) `COMPARED`, by stamp."""
+        """Return all epochs compared so far, (n,) `COMPARED`, by stamp."""
         compared = np.concatenate([np.zeros(0, COMPARED), *self._compared])
         return compared[np.argsort(compared["stamp"], kind="stable")]
 
@@ -128,7 +128,7 @@ class TruthComparison:
 def compare(
     before: NDArray[Any], after: NDArray[Any], epochs: NDArray[Any], map_frame: MapFrame, point_body: Array
 ) -> NDArray[Any]:
-    """Errors of the estimate, interpolated between the ODOMETRY rows `before` and `after` (n,), at `epochs` (n,).
+    """Return the errors of the estimate, interpolated between the ODOMETRY rows `before` and `after` (n,), at `epochs`.
 
     NEES is e' P^-1 e with three degrees of freedom. The attitude error is the rotation vector in map axes that turns
     the estimate into the truth, as in the filter; the covariance of the truth is added to that of the estimate.
@@ -175,7 +175,10 @@ def compare(
 
 
 def rotation_matrices(quaternions: Array) -> Array:
-    """Rotation matrices (n, 3, 3) of quaternions (n, 4; w x y z) of any length (Sola, eq. 115); NaN for length zero."""
+    """Return rotation matrices (n, 3, 3) of quaternions (n, 4; w x y z) of any length (Sola, eq. 115).
+
+    The matrix of a quaternion of length zero is NaN.
+    """
     with np.errstate(invalid="ignore"):
         w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
     return np.stack(
@@ -189,7 +192,7 @@ def rotation_matrices(quaternions: Array) -> Array:
 
 
 def rotation_vectors(rotations: Array) -> Array:
-    """Rotation vectors (n, 3), rad, of rotation matrices (n, 3, 3) that turn by less than pi."""
+    """Return rotation vectors (n, 3), rad, of rotation matrices (n, 3, 3) that turn by less than pi."""
     sines = 0.5 * np.stack(
         [
             rotations[:, 2, 1] - rotations[:, 1, 2],
@@ -204,7 +207,7 @@ def rotation_vectors(rotations: Array) -> Array:
 
 
 def _between_attitudes(before: Array, after: Array, share: Array) -> Array:
-    """Rotation matrices between two nearby attitudes (n, 4): chord instead of arc, good to 1e-6 rad at 1 rad/s."""
+    """Return rotation matrices between nearby attitudes (n, 4): chord for arc, good to 1e-6 rad at 1 rad/s."""
     after = np.where((np.sum(before * after, axis=1) < 0.0)[:, None], -after, after)
     return rotation_matrices((1.0 - share)[:, None] * before + share[:, None] * after)
 

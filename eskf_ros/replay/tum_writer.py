@@ -1,4 +1,4 @@
-"""Compiled writing of numbers as text: Python's own formatting would be a tenth of the time of a replay."""
+"""Compiled writing of TUM trajectories: Python's own formatting would take a tenth of the time of a replay."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from eskf_ros.compiled import njit
 
 LINE_BYTES = 256
-"""More than a line of `tum_text` can take: its stamp, and seven numbers of at most 19 digits."""
+"""Upper limit of the length of a line: its stamp, and seven numbers of at most 19 digits."""
 TUM_DECIMALS = np.array([6, 6, 6, 9, 9, 9, 9])
 """Decimals of x y z (m) and qx qy qz qw."""
 
 
 def tum_text(stamps: NDArray[np.int64], numbers: NDArray[np.float64]) -> bytes:
-    """Lines of a TUM trajectory: `t x y z qx qy qz qw`, t in seconds with all nine decimals of the stamp.
+    """Return lines of a TUM trajectory: `t x y z qx qy qz qw`, t in seconds with all nine decimals of the stamp.
 
     `stamps` (n,) are ns and not negative, `numbers` (n, 7) finite.
     """
@@ -43,7 +43,7 @@ def _tum(text, stamps, numbers, decimals):  # type: ignore[no-untyped-def]
 
 @njit
 def _put_fixed(text, place, scaled, decimals):  # type: ignore[no-untyped-def]
-    """Write the integer `scaled` >= 0 with a point before its last `decimals` digits; return the place behind it."""
+    """Write the integer `scaled` >= 0 with a point before its last `decimals` digits; return the index behind it."""
     count = 0
     rest = scaled
     while rest > 0 or count <= decimals:

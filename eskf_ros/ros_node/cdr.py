@@ -1,10 +1,10 @@
 """Imu and Odometry between their serialised form and numbers, without message objects in between.
 
-At 1 kHz the message objects of rclpy cost more than the filter. So the node subscribes to and publishes serialised
-messages (OMG CDR): 4 bytes of encapsulation, then the fields, each aligned to its own size counted from byte 4. A
-string is a uint32 length, which counts the closing NUL, and the bytes; so everything after the strings lies at a
-place that depends only on their lengths. Only little-endian CDR (00 01 00 00) is handled here, which is what every ROS
-machine of today sends; the classes with `message` in their name do the rest the ordinary way.
+At 1 kHz the message objects of rclpy cost more than the filter. The node therefore subscribes to and publishes
+serialised messages (OMG CDR): 4 bytes of encapsulation, then the fields, each aligned to its own size counted from byte
+4. A string is a uint32 length, which counts the closing NUL, and the bytes; the position of everything after the
+strings therefore depends on their lengths only. Only little-endian CDR (00 01 00 00) is handled here, which is what
+every ROS machine of today sends; the classes with `message` in their name handle the rest by message objects.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _ODOMETRY_DOUBLES = 85
 
 
 class LayoutError(RuntimeError):
-    """The message library does not read what was written here: its Odometry is not the one this module knows."""
+    """The message library does not read what was written: its Odometry has another layout than assumed here."""
 
 
 def _aligned(position: int, size: int) -> int:
@@ -34,14 +34,14 @@ def _aligned(position: int, size: int) -> int:
 
 @lru_cache(maxsize=64)
 def _imu_layout(frame_length: int) -> struct.Struct:
-    """Encapsulation, seconds, nanoseconds, string length, string with NUL, angular velocity, linear acceleration."""
+    """Return the layout: encapsulation, seconds, nanoseconds, string length, string with NUL, rates, accelerations."""
     padding = _aligned(12 + frame_length, 8) - (12 + frame_length)
     orientation_with_covariance, covariance = 13 * 8, 9 * 8
     return struct.Struct(f"<IiII{frame_length}s{padding + orientation_with_covariance}x3d{covariance}x3d{covariance}x")
 
 
 class ImuReader:
-    """Reads serialised sensor_msgs/Imu; one reader for each subscription, as it remembers the header's length."""
+    """Reads serialised sensor_msgs/Imu; each subscription needs its own: it remembers the frame name."""
 
     def __init__(self) -> None:
         self._set_frame_length(1)
@@ -49,15 +49,15 @@ class ImuReader:
         self._frame = b""
 
     def read(self, data: bytes) -> ImuSample | None:
-        """The numbers of one message; None if it is not laid out as expected, for whatever reason.
+        """Return the numbers of one message; None if its layout is not the expected one.
 
-        Any bytes may be given, nothing is raised. The numbers are not judged: NaN and absurd values pass. None asks for
-        the ordinary way, `imu_from_message`, which may well find the message good.
+        Any bytes may be given, nothing is raised. The numbers are not checked: NaN and absurd values pass. After None,
+        deserialise the message and call `imu_from_message`: it may still be good.
         """
         if len(data) != self._size and not self._adapt(data):
             return None
         values = self._layout.unpack_from(data)
-        if values[3] != self._frame_length:  # eight lengths of the string make messages of one size
+        if values[3] != self._frame_length:  # names of eight different lengths give messages of one size
             if not self._adapt(data):
                 return None
             values = self._layout.unpack_from(data)
@@ -71,7 +71,7 @@ class ImuReader:
         return seconds * 1_000_000_000 + nanoseconds, values[8:11], values[5:8], self._frame
 
     def _adapt(self, data: bytes) -> bool:
-        """Take over the length of the frame name in `data`; False if that is no Imu of this form."""
+        """Adapt to the length of the frame name in `data`; return False if that is no Imu of this form."""
         if len(data) < 16:
             return False
         frame_length = int.from_bytes(data[12:16], "little")
@@ -87,7 +87,7 @@ class ImuReader:
 
 
 def imu_from_message(message: Any) -> ImuSample:
-    """The same numbers out of a sensor_msgs/Imu object, as `deserialize_message` returns it."""
+    """Return the same numbers from a sensor_msgs/Imu object, as `deserialize_message` returns it."""
     stamp, force, rate = message.header.stamp, message.linear_acceleration, message.angular_velocity
     return (
         stamp.sec * 1_000_000_000 + stamp.nanosec,
@@ -98,7 +98,7 @@ def imu_from_message(message: Any) -> ImuSample:
 
 
 class AnyOdometryWriter(Protocol):
-    """What `publisher.publish` takes for one odometry: made by either of the two writers below."""
+    """Makes what `publisher.publish` takes for one odometry: either of the two writers below."""
 
     def write(self, stamp: int, numbers: NDArray[np.float64]) -> Any: ...
 
@@ -107,7 +107,7 @@ class OdometryWriter:
     """Writes nav_msgs/Odometry for two fixed frame names into prepared bytes."""
 
     def __init__(self, frame_id: str, child_frame_id: str) -> None:
-        """Prepare the bytes and have the message library read them back.
+        """Prepare the bytes and let the message library read them back.
 
         Raises LayoutError if it reads anything else than was written; ImportError without rclpy and nav_msgs.
         """
@@ -125,7 +125,7 @@ class OdometryWriter:
         self._verify(frame_id, child_frame_id)
 
     def write(self, stamp: int, numbers: NDArray[np.float64]) -> bytes:
-        """One serialised Odometry: `stamp` in ns, `numbers` (85,) contiguous and in the order of the message.
+        """Return one serialised Odometry: `stamp` in ns, `numbers` (85,) contiguous, in the order of the message.
 
         That is position x y z (m), orientation x y z w of the child frame in the frame, covariance of the pose (36),
         linear (m/s) and angular velocity (rad/s) in the child frame, covariance of the twist (36).
@@ -135,7 +135,7 @@ class OdometryWriter:
         return bytes(self._buffer)
 
     def _verify(self, frame_id: str, child_frame_id: str) -> None:
-        """Write a different number to every place and compare what the message library reads with it."""
+        """Write a different number to each field and compare what the message library reads with it."""
         from nav_msgs.msg import Odometry
         from rclpy.serialization import deserialize_message
 
@@ -160,10 +160,10 @@ class OdometryWriter:
 
 
 class OdometryMessageWriter:
-    """The ordinary way, slower by the making of a message: same use as OdometryWriter, message objects come out."""
+    """Makes message objects, more slowly; same use as `OdometryWriter`."""
 
     def __init__(self, frame_id: str, child_frame_id: str) -> None:
-        """Raises ImportError without nav_msgs."""
+        """Prepare the writer for two frame names. Raises ImportError without nav_msgs."""
         from nav_msgs.msg import Odometry
 
         self._message_type = Odometry
@@ -171,7 +171,7 @@ class OdometryMessageWriter:
         self._child_frame_id = child_frame_id
 
     def write(self, stamp: int, numbers: NDArray[np.float64]) -> Any:
-        """One nav_msgs/Odometry; arguments as in `OdometryWriter.write`.
+        """Return one nav_msgs/Odometry; arguments as in `OdometryWriter.write`.
 
         The setters of rclpy do not check: everything but a Python float, or a flat float64 array, becomes garbage.
         """

@@ -1,4 +1,4 @@
-"""What the stamps of a topic tell about its clock: delay, rate, stamps never filled in, and time that starts again."""
+"""Stamp monitor of a topic: delay, rate, stamps that are never filled in, and time that jumps."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ from dataclasses import dataclass
 from eskf_ros.filter.state.time import SECOND
 
 MEMORY = 100
-"""Messages over which delay and rate are taken."""
+"""Messages over which delay and rate are computed."""
 
 LONG_AGO = 10.0
-"""Stamps so many seconds behind their arrival are those of a recording, or of a clock that was never set."""
+"""s; stamps further behind their arrival are those of a recording, or of a clock that was never set."""
 
 CONFIRMATIONS = 5
-"""So many messages in a row must go on from where the stamps jumped to."""
+"""Messages in a row that must follow each other at the new time before a jump of the stamps is believed."""
 
 
 class Stamp(enum.Enum):
-    """What to do with a message, judged by its stamp and those before it."""
+    """What to do with a message, judged by its stamp and the ones before it."""
 
     IN_ORDER = enum.auto()
     ZERO = enum.auto()
-    """The header was not filled in: the message cannot be placed in time and must not be used."""
+    """The header was not filled in: the message has no place in time and must not be used."""
     ELSEWHERE = enum.auto()
-    """Further from the others than the window: the estimator's own door decides."""
+    """Further from the others than the window: the admission of the estimator decides."""
     STARTED_AGAIN = enum.auto()
-    """The stamps went back and go on from there (a bag that loops, a simulation reset): reset, then use the message."""
+    """The stamps went back and continue from there (a bag that loops, a simulation reset): reset, then use it."""
     WENT_AHEAD = enum.auto()
-    """They jumped ahead, while this computer's clock did not, and go on from there (a clock was set): worth a word."""
+    """The stamps jumped ahead, this computer's clock did not (a sensor clock was set): use the message, and log it."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Arrival minus stamp and rate over the last messages; NaN where nothing came yet.
+    """Arrival minus stamp, and rate, over the last messages; NaN before the first message.
 
-    `delay` is the median and `spread` the width of the interval that holds nine of ten messages (s). `rate` is in Hz
-    of stamps and sinks while nothing arrives; `silence` is the time since the last arrival (s).
+    `delay` is the median and `spread` the width of the interval that holds nine of ten messages (s). `rate` is in Hz of
+    stamps and decreases while nothing arrives; `silence` is the time since the last arrival (s).
     """
 
     delay: float
@@ -50,10 +50,13 @@ class Timing:
 
 
 class StampMonitor:
-    """The stamps of one topic. All times are integer nanoseconds; arrivals are of the node's clock."""
+    """Watches the stamps of one topic. All times are integer nanoseconds; arrivals are on the node's clock."""
 
     def __init__(self, topic: str, window: float = 2.0, sender: str = "") -> None:
-        """`window` (s): how far out of order stamps may be; the history window of the filter. `sender`: of several."""
+        """Make a monitor of `topic`; `sender` distinguishes several senders on it.
+
+        `window` (s): how far out of order stamps may be; the history window of the filter.
+        """
         self.topic = topic
         self.label = f"{topic} from {sender}" if sender else topic
         self.zero_count = 0
@@ -66,7 +69,7 @@ class StampMonitor:
         self.restart()
 
     def restart(self) -> None:
-        """Forget where the stamps were; counts stay. For all topics when one STARTED_AGAIN, or the clock was reset."""
+        """Forget the stamps; counts stay. To be called for all topics after STARTED_AGAIN or a reset of the clock."""
         self._newest: int | None = None
         self._elsewhere = 0
         self._elsewhere_count = 0
@@ -74,7 +77,7 @@ class StampMonitor:
         self._delays.clear()
 
     def note(self, stamp: int, arrival: int) -> Stamp:
-        """Take note of a message, with the configured time offset applied to its stamp; returns what to do with it."""
+        """Record a message, with the configured time offset applied to its stamp; return what to do with it."""
         if stamp == 0:
             self.zero_count += 1
             self.zero_run += 1
@@ -84,7 +87,7 @@ class StampMonitor:
         if self._newest is None:
             self._newest = stamp
         ahead = stamp - self._newest
-        # A pause of the sensor is one for the clock of the arrivals too; a wrong stamp is not.
+        # In a pause of the sensor stamps and arrivals move on together; a wrong stamp moves alone.
         paused = ahead > 0 and bool(self._delays) and abs(arrival - stamp - self._delays[-1]) <= self._window
         if not paused and not -self._window <= ahead <= self._window:
             return self._note_elsewhere(stamp, arrival)
@@ -96,7 +99,7 @@ class StampMonitor:
         return Stamp.IN_ORDER
 
     def _note_elsewhere(self, stamp: int, arrival: int) -> Stamp:
-        """A single odd stamp moves nothing, several that follow each other do, forward and back alike."""
+        """Record a stamp outside the window: one changes nothing, several that follow each other are a jump."""
         follows = 0 < stamp - self._elsewhere <= self._window
         self._elsewhere_count = self._elsewhere_count + 1 if follows else 1
         self._elsewhere = stamp
@@ -112,7 +115,7 @@ class StampMonitor:
         return Stamp.STARTED_AGAIN if back else Stamp.WENT_AHEAD
 
     def timing(self, now: int) -> Timing:
-        """Delay, spread, rate and silence at `now` (node's clock)."""
+        """Return delay, spread, rate and silence at `now` (ns, node's clock)."""
         count = len(self._delays)
         if count == 0:
             return Timing(math.nan, math.nan, 0.0, math.nan)
@@ -128,9 +131,9 @@ class StampMonitor:
 
 
 def clock_complaints(monitors: Iterable[StampMonitor], now: int, tolerance: float = 1.0) -> list[str]:
-    """What is wrong with the clocks, a sentence each with what to do; empty when nothing is.
+    """Return one sentence for each fault of the clocks, with what to do; empty without faults.
 
-    Clocks differ when the delays of two topics differ by more than `tolerance` (s).
+    Clocks differ if the delays of two topics differ by more than `tolerance` (s).
     """
     found = []
     delays = []

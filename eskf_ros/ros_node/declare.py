@@ -1,4 +1,4 @@
-"""The parameter tree on a ROS node: declaration, overrides from files and command line, and changes while it runs."""
+"""The parameter tree on a ROS node: declaration, overrides from files and command line, changes at run time."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from eskf_ros.parameters.tree import Parameters
 
 
 def declare(node: Node, source: str = "") -> Parameters:
-    """Declare every parameter on the node and return the values it got from parameter files and the command line.
+    """Declare every parameter on the node; return the values from parameter files and the command line.
 
-    The overrides are checked as a whole before anything is declared, by the rules that `--config` of the replay
-    follows. `source` names them in errors (default: the node). Raises ParameterError listing every unknown key (with
-    the closest known one), wrong type and value outside its range.
+    The overrides are checked as a whole before anything is declared, by the same rules as `--config` of the replay.
+    `source` names them in errors (default: the node). Raises ParameterError listing every unknown key (with the closest
+    known one), wrong type and value outside its range.
     """
     known = {leaf.name: leaf for leaf in leaves()}
     given = {name: _given(parameter, known.get(name)) for name, parameter in _overrides(node).items()}
@@ -29,9 +29,9 @@ def declare(node: Node, source: str = "") -> Parameters:
 
 
 def unused_overrides(node: Node) -> list[str]:
-    """Names that were given but belong to nothing on this node, such as `qos_overrides.` of a topic it has not.
+    """Return the given names that belong to nothing on this node, such as `qos_overrides.` of a missing topic.
 
-    To be asked when all publishers and subscriptions exist: they declare the overrides of their quality of service.
+    To be called when all publishers and subscriptions exist: they declare the overrides of their quality of service.
     """
     return sorted(name for name in _overrides(node) if not node.has_parameter(name))
 
@@ -78,16 +78,16 @@ def _descriptor(leaf: Leaf) -> ParameterDescriptor:
 
 
 class LiveParameters:
-    """Watches the parameters of a node: refuses what is not allowed, and tells what changed.
+    """Watches the parameters of a node: refuses what is not allowed, and reports what has changed.
 
     `current` always holds the values in force.
     """
 
     def __init__(self, node: Node, current: Parameters, on_change: Callable[[Parameters], None]) -> None:
-        """To be made after `declare`, with what that returned.
+        """Watch the parameters that `declare` has returned.
 
-        `on_change` gets the whole tree after each change that was accepted; several parameters that are set atomically
-        are one change.
+        `on_change` gets the whole tree after each accepted change; several parameters that are set atomically are one
+        change.
         """
         self.current = current
         self._on_change = on_change
@@ -97,7 +97,7 @@ class LiveParameters:
         node.add_post_set_parameters_callback(self._apply)
 
     def _with_floats(self, changes: list[Parameter]) -> list[Parameter]:
-        """People write 2 for 2.0; rclpy would refuse it as a wrong type."""
+        """Turn integers into floats where a float is expected: people write 2 for 2.0, which rclpy would refuse."""
         return [self._with_float(change) for change in changes]
 
     def _with_float(self, change: Parameter) -> Parameter:

@@ -1,4 +1,4 @@
-"""The node's diagnostics: the state, what it waits for, what is wrong and what to do."""
+"""The node's diagnostics: the status, what it waits for, faults, and what to do."""
 
 from __future__ import annotations
 
@@ -35,32 +35,34 @@ RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFOR
 TRANSIENT_LOCAL, VOLATILE = DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE
 
 SILENCE = 3.0
-"""Seconds without a message after which a topic is called silent."""
+"""s; a topic without a message for longer is called silent."""
 
 FEWEST_TO_SOLVE = 4
-"""Satellites that fix a position by themselves."""
+"""Satellites, at least, that determine a position by themselves."""
 
 GROUP_NAMES = {**{int(gnss): gnss.name.lower() for gnss in Gnss}, BEIDOU_3: "beidou-3", int(Gnss.BEIDOU): "beidou-2"}
-"""What `gnss.signals.time_group` tells apart."""
+"""Names of the groups of `gnss.signals.time_group`."""
 
 PHASE_LABELS = {
     Stream.GNSS_POSITION: "fixes",
     Stream.GNSS_VELOCITY: "velocities",
     Stream.PSEUDORANGE: "position by pseudoranges",
 }
+"""Names of streams whose phase is reported; other streams have their own name."""
+
 SENSORS = (
     *((row.stream, 0) for row in ROWS_OF_SENSORS),
     *((stream, source) for stream in (Stream.GNSS_POSITION, Stream.GNSS_VELOCITY) for source in range(SOURCES)),
 )
-"""Streams, and for receivers which of them, whose phase is told once something came."""
+"""Streams and sources (which receiver) whose phase is reported after their first measurement."""
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What the node shows of itself once a second."""
+    """What the node reports of itself once a second."""
 
     graph: Node
-    """Who publishes and listens to what."""
+    """The node, which knows who publishes and subscribes to what."""
     now: int
     """Time of the node's clock (ns)."""
     navigator: Navigator
@@ -68,12 +70,12 @@ class Snapshot:
     imu_monitor: StampMonitor
     aid_inputs: Sequence[AidInput]
     inputs: Sequence[tuple[Any, Input | None]]
-    """Subscriptions, and which inputs they are."""
+    """Subscriptions, and the inputs that they are."""
     output_publishers: Sequence[Any]
     outputs: Outputs
     range_intake: RangeIntake | None
     position_stream: Stream
-    """What brings the position: fixes or pseudoranges."""
+    """The stream that gives the position: fixes or pseudoranges."""
     latest_positions: Mapping[Verdict, int]
     """Verdicts of the last fixes or pseudoranges."""
     verdicts: Mapping[tuple[int, Verdict], int]
@@ -82,24 +84,26 @@ class Snapshot:
     extrinsics: Extrinsics
     resets: int
     callbacks: int
+    """Callbacks of the IMU since the last report."""
     callback_time: float
+    """s; time spent in them."""
     longest_callback: float
-    """Seconds in callbacks of the IMU since the last report, and in the longest of them."""
+    """s; the longest of them."""
 
     @property
     def monitors(self) -> list[StampMonitor]:
-        """What watches the stamps of the inputs, that of the IMU first."""
+        """The stamp monitors of the inputs, that of the IMU first."""
         return [self.imu_monitor, *(monitor for source in self.aid_inputs for monitor in source.monitors)]
 
 
 def status_report(seen: Snapshot, stamp: Time) -> DiagnosticArray:
-    """One status: OK when the state is GOOD and nothing is wrong, ERROR when nothing is published any more."""
+    """Return one status: OK if the state is GOOD without faults, ERROR if nothing is published any more."""
     now = seen.now
     row = seen.navigator.odometry[0]
     status = Status(int(row["status"]))
     is_silent = status > Status.WAITING_IMU and bool(missing(seen, [seen.imu_monitor], now))
     if is_silent and status != Status.FAULT:
-        # Whatever the estimate was worth: nothing is published without the IMU.
+        # Nothing is published without the IMU, however good the estimate was.
         status = Status.WAITING_IMU
     of_ranges = [] if seen.range_intake is None else seen.range_intake.recent_complaints
     problems = [*seen.navigator.complaints, *of_ranges, *clock_complaints(seen.monitors, now)]
@@ -123,7 +127,7 @@ def status_report(seen: Snapshot, stamp: Time) -> DiagnosticArray:
 
 
 def waiting_for(seen: Snapshot, status: Status, row: np.void, now: int) -> list[str]:
-    """What keeps the state from the next rung."""
+    """Return what keeps the status from the next one."""
     wanted_input = "gnss_fix" if seen.range_intake is None else "ranges"
     fixes = next(source for source in seen.aid_inputs if source.kind.name == wanted_input).monitors
     is_tight = seen.position_stream == Stream.PSEUDORANGE
@@ -149,7 +153,7 @@ def waiting_for(seen: Snapshot, status: Status, row: np.void, now: int) -> list[
 
 
 def held_by_few(seen: Snapshot, row: np.void) -> list[str]:
-    """Say so when satellites that are too few for a position of their own are fused nevertheless."""
+    """Return a sentence if fewer satellites are fused than a position of their own needs."""
     epoch = seen.navigator.latest_epoch
     fused = epoch[np.isin(epoch["verdict"], (Verdict.FUSED, Verdict.WEIGHED_DOWN))]
     count = len({name_of(source).split()[0] for source in fused["source"].tolist()})
@@ -163,14 +167,14 @@ def held_by_few(seen: Snapshot, row: np.void) -> list[str]:
 
 
 def latest_verdicts(seen: Snapshot) -> str:
-    """What became of the fixes, or of the pseudoranges, of the last report that has some."""
+    """Return the verdicts of the fixes, or of the pseudoranges, of the last report that has some."""
     counts = seen.latest_positions
     told = ", ".join(f"{count} {verdict.name.lower()}" for verdict, count in sorted(counts.items()))
     return f" (the last: {told}): see eskf/aids" if told else ": see eskf/aids"
 
 
 def missing(seen: Snapshot, monitors: Sequence[StampMonitor], now: int) -> list[str]:
-    """Say so when nothing comes on a topic, from any of those watched on it, and who could send."""
+    """Return a sentence if no message comes on a topic from any of the senders watched on it, with who could send."""
     silences = [silence for monitor in monitors if not math.isnan(silence := monitor.timing(now).silence)]
     if silences and min(silences) <= SILENCE:
         return []
@@ -181,7 +185,7 @@ def missing(seen: Snapshot, monitors: Sequence[StampMonitor], now: int) -> list[
 
 
 def elsewhere(seen: Snapshot, topic: str) -> str:
-    """Where else messages of the type of an input are published, if nobody publishes them on its topic."""
+    """Return other topics with messages of the type of an input, if nobody publishes on its own topic."""
     if seen.graph.count_publishers(topic):
         return ""
     kind = next(type_name(subscription.msg_type) for subscription, _ in seen.inputs if subscription.topic_name == topic)
@@ -195,7 +199,7 @@ def elsewhere(seen: Snapshot, topic: str) -> str:
 
 
 def mismatches(seen: Snapshot) -> list[str]:
-    """Publishers whose messages cannot reach us, and subscribers that ours cannot reach: type or quality of service."""
+    """Return publishers and subscribers that cannot exchange messages with this node: type or quality of service."""
     found = []
     for subscription, kind in seen.inputs:
         wanted, expected = subscription.qos_profile, type_name(subscription.msg_type)
@@ -225,18 +229,18 @@ def mismatches(seen: Snapshot) -> list[str]:
 
 
 def type_name(kind: Any) -> str:
-    """sensor_msgs/msg/Imu of the class."""
+    """Return the name of a message class, such as sensor_msgs/msg/Imu."""
     package, subfolder = kind.__module__.split(".")[:2]
     return f"{package}/{subfolder}/{kind.__name__}"
 
 
 def node_name(endpoint: TopicEndpointInfo) -> str:
-    """Name of the node at one end of a topic."""
+    """Return the name of the node at one end of a topic."""
     return f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"
 
 
 def second_publishers(seen: Snapshot) -> list[str]:
-    """Transforms that are ours and that somebody else publishes too."""
+    """Return a sentence if another node publishes the same transforms."""
     output = seen.outputs.transforms
     if output is None or not output.watch.strangers:
         return []
@@ -249,7 +253,7 @@ def second_publishers(seen: Snapshot) -> list[str]:
 
 
 def figures(seen: Snapshot, row: np.void) -> dict[str, object]:
-    """Uncertainty, biases, and how much was published."""
+    """Return uncertainty, biases, and counts of what was published."""
     sigma = [math.sqrt(max(0.0, row["pose_covariance"][i, i])) for i in range(6)]
     return {
         "position std (m)": " ".join(f"{value:.3f}" for value in sigma[:3]),
@@ -272,7 +276,7 @@ def figures(seen: Snapshot, row: np.void) -> dict[str, object]:
 
 
 def phases(seen: Snapshot) -> dict[str, object]:
-    """What the measurements of the first receiver are to the filter, and of the other sensors those that came."""
+    """Return the phase of the streams of the first receiver, and of the other streams that had a measurement."""
     usual: tuple[Stream, ...] = (Stream.PSEUDORANGE,)
     if seen.position_stream != Stream.PSEUDORANGE:
         usual = (Stream.GNSS_POSITION, Stream.GNSS_VELOCITY)
@@ -288,7 +292,7 @@ def phases(seen: Snapshot) -> dict[str, object]:
 
 
 def ranges(seen: Snapshot) -> dict[str, object]:
-    """What is known of the receiver's clock, and what became of the signals before the filter."""
+    """Return the receiver clock, and the counts of signals by status."""
     navigator, intake = seen.navigator, seen.range_intake
     if intake is None:
         return {}
@@ -305,7 +309,7 @@ def ranges(seen: Snapshot) -> dict[str, object]:
 
 
 def counters(seen: Snapshot) -> dict[str, object]:
-    """Measurements by stream and final verdict, IMU samples by what became of them, trouble by kind."""
+    """Return the counts of measurements by stream and final verdict, of IMU samples and of errors by kind."""
     found: dict[str, object] = {
         f"{STREAM_NAMES[stream]} {verdict.name.lower()}": count for (stream, verdict), count in seen.verdicts.items()
     }
@@ -315,7 +319,7 @@ def counters(seen: Snapshot) -> dict[str, object]:
 
 
 def topics(seen: Snapshot, now: int) -> dict[str, object]:
-    """Rate and delay of each input that was heard of."""
+    """Return rate and delay of each input that had a message."""
     found: dict[str, object] = {}
     for monitor in seen.monitors:
         timing = monitor.timing(now)

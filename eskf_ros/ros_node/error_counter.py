@@ -1,4 +1,4 @@
-"""What goes wrong in the node, counted by kind: logged the first time, a problem as long as it is fresh."""
+"""Errors in the node, counted by kind: logged the first time, reported as a problem while they are fresh."""
 
 from __future__ import annotations
 
@@ -6,28 +6,28 @@ import time
 from collections.abc import Callable
 
 KINDS = 100
-"""No more kinds than this are told apart: a sender of nonsense must not fill the memory."""
+"""Kinds of errors that are distinguished, at most: nonsense from a sender must not fill the memory."""
 
 FRESH = 10.0
-"""Seconds for which something that went wrong is a present problem."""
+"""s; time for which an error is reported as a present problem."""
 
 
 class Trouble:
-    """Counts kinds of trouble.
+    """Counts errors by kind.
 
     Attributes:
-        counts: how often each was met.
+        counts: how often each kind has occurred.
     """
 
     def __init__(self, log: Callable[[str], object], now: Callable[[], float] = time.monotonic) -> None:
-        """`log` gets each kind once; `now` gives seconds on a clock that nobody sets."""
+        """Make a counter; `log` gets each kind once; `now` returns seconds on a monotonic clock."""
         self.counts: dict[str, int] = {}
         self._log = log
         self._now = now
         self._last: dict[str, float] = {}
 
     def note(self, kind: str) -> None:
-        """Count something that went wrong."""
+        """Count an error."""
         if kind not in self.counts:
             if len(self.counts) >= KINDS:
                 return
@@ -36,7 +36,7 @@ class Trouble:
         self._last[kind] = self._now()
 
     def problems(self) -> list[str]:
-        """What went wrong lately, a sentence each."""
+        """Return one sentence for each kind of error that has occurred lately."""
         now = self._now()
         return [
             f"{kind} ({self.counts[kind]} {'time' if self.counts[kind] == 1 else 'times'})"

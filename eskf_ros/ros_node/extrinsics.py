@@ -1,4 +1,4 @@
-"""Where the sensors sit in base_link: from the parameters, or from /tf_static by the frame names in the messages."""
+"""Positions of the sensors in base_link: from the parameters, or from /tf_static by the frames of their messages."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ IMU, ANTENNA, SECOND_ANTENNA = "IMU", "GNSS antenna", "second GNSS antenna"
 
 PLACES = {
     IMU: Place("imu.mount_position", "imu.mount_rpy_deg"),
-    # Not by the velocities: many drivers name the axes they are given in.
+    # The messages of velocities do not count: many drivers name the axes of the velocity, not the antenna.
     ANTENNA: Place("gnss.lever_arm", inputs=("gnss_fix", "ranges")),
     SECOND_ANTENNA: Place("second_gnss.lever_arm"),
     **{row.label: row.place for row in SENSORS if row.place},
 }
-"""One row for each sensor whose place in base_link counts."""
+"""The sensors whose place in base_link matters: the parameters of the place, and the inputs that name their frame."""
 
 
 def place_of(name: str, receiver: int = 0) -> str:
-    """The sensor of the input with this name; empty where its place is of no account."""
+    """Return the sensor of the input with this name; empty if its place does not matter."""
     if receiver:
         return SECOND_ANTENNA
     return next((sensor for sensor, place in PLACES.items() if name in place.inputs), "")
 
 
 class Extrinsics:
-    """Collects static transforms and the frames of the sensors, and completes the parameters with what they tell.
+    """Collects static transforms and the frames of the sensors, and completes the parameters with them.
 
-    Reading is a matter of the first messages: afterwards nothing changes, and nothing is looked up any more.
+    Only the first messages matter: once found, a place does not change and is not looked up again.
     """
 
     def __init__(self, parameters: Parameters) -> None:
-        """`parameters` as somebody gave them: what is not zero there is not looked up."""
+        """Take `parameters` as the user gave them: places that are not zero there are not looked up."""
         self._base_link = parameters.frames.base_link
         values = to_mapping(parameters)
         self._wanted: set[str] = set()
@@ -55,7 +55,7 @@ class Extrinsics:
         self._found: dict[str, Pose] = {}
 
     def note_transform(self, message: Any) -> None:
-        """Take note of one geometry_msgs/TransformStamped of /tf_static."""
+        """Record one geometry_msgs/TransformStamped of /tf_static."""
         t, q = message.transform.translation, message.transform.rotation
         quaternion = np.array([q.x, q.y, q.z, q.w])
         position = np.array([t.x, t.y, t.z])
@@ -66,20 +66,20 @@ class Extrinsics:
 
     @property
     def sensors(self) -> list[str]:
-        """Those that every robot has, and those that messages came from."""
+        """The sensors that every robot has, and those that have sent messages."""
         return [sensor for sensor in PLACES if sensor in (IMU, ANTENNA, *self._frames)]
 
     def note_frame(self, sensor: str, frame: str) -> bool:
-        """Take note of a frame that a sensor's messages name; the first one that is known counts.
+        """Record a frame that the messages of a sensor name; return whether it is the first one of this sensor.
 
-        Says whether it is the first frame of this sensor at all.
+        Of several frames the first one with a known place counts.
         """
         frames = self._frames.setdefault(sensor, [])
         frames.append(frame)
         return len(frames) == 1
 
     def find(self) -> list[str]:
-        """Look for the sensors not found so far; return a line for each that was found now."""
+        """Look up the sensors not found yet; return one line for each that was found now."""
         lines = []
         for sensor in sorted(self._wanted - set(self._found)):
             for frame in self._frames.get(sensor, []):
@@ -87,7 +87,7 @@ class Extrinsics:
                 if pose is None or sensor in self._found:
                     continue
                 self._found[sensor] = pose
-                # Plus zero: no sign on a zero.
+                # Adding zero removes the sign of a negative zero.
                 place = " ".join(f"{value:.3f}" for value in np.round(pose[0], 3) + 0.0)
                 angles = " ".join(f"{value:.2f}" for value in np.round(roll_pitch_yaw_deg(pose[1]), 2) + 0.0)
                 lines.append(
@@ -97,7 +97,7 @@ class Extrinsics:
         return lines
 
     def completed(self, parameters: Parameters) -> Parameters:
-        """The parameters with the places that were found."""
+        """Return the parameters with the places that were found."""
         for sensor, (position, rotation) in self._found.items():
             if PLACES[sensor].position:
                 parameters = _changed(parameters, PLACES[sensor].position, position)
@@ -106,13 +106,13 @@ class Extrinsics:
         return parameters
 
     def source_of(self, sensor: str) -> str:
-        """Where the place of a sensor comes from, for the diagnostics."""
+        """Return where the place of a sensor comes from, for the diagnostics."""
         if sensor in self._found:
             return "/tf_static"
         return f"taken to be {self._base_link}" if sensor in self._wanted else "parameters"
 
     def _in_base_link(self, frame: str) -> Pose | None:
-        """The pose of a frame in base_link, where both hang on one tree."""
+        """Return the pose of a frame in base_link; None unless both belong to one tree."""
         of_base = self._ancestors(self._base_link)
         for name, (position, rotation) in self._ancestors(frame).items():
             if name in of_base:
@@ -121,7 +121,7 @@ class Extrinsics:
         return None
 
     def _ancestors(self, frame: str) -> dict[str, Pose]:
-        """The pose of a frame in itself, its parent, and so on upwards."""
+        """Return the pose of a frame in itself, in its parent, and so on upwards."""
         pose: Pose = np.zeros(3), np.eye(3)
         found = {frame: pose}
         while frame in self._parents:
@@ -140,7 +140,7 @@ def _changed(parameters: Parameters, name: str, values: np.ndarray) -> Parameter
 
 
 def matrix_of(x: float, y: float, z: float, w: float) -> np.ndarray:
-    """The rotation matrix of a unit quaternion."""
+    """Return the rotation matrix of a unit quaternion."""
     return np.array(
         [
             [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
@@ -151,7 +151,7 @@ def matrix_of(x: float, y: float, z: float, w: float) -> np.ndarray:
 
 
 def roll_pitch_yaw_deg(matrix: np.ndarray) -> np.ndarray:
-    """Roll, pitch and yaw (3,) of a rotation matrix, about fixed axes; pitch from -90 to 90 degrees."""
+    """Return roll, pitch and yaw (3,) (deg, fixed axes) of a rotation matrix; pitch from -90 to 90 degrees."""
     pitch = math.atan2(-matrix[2, 0], math.hypot(matrix[2, 1], matrix[2, 2]))
     if math.hypot(matrix[2, 1], matrix[2, 2]) < 1e-9:
         # Straight up or down: roll and yaw turn about the same axis, and all of it is called yaw.

@@ -23,7 +23,7 @@ Compile the estimator for this processor and end: the next start, of this user, 
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the node until SIGINT or SIGTERM; returns 0, or 2 when an argument or a parameter cannot be used."""
+    """Run the node until SIGINT or SIGTERM; return 0, or 2 if an argument or a parameter cannot be used."""
     words = sys.argv[1:] if arguments is None else list(arguments)
     if words and words[0] in ("-h", "--help"):
         print(USAGE, end="")
@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _compile() -> int:
-    """Compile all that a node calls, in both modes, and say where the machine code is."""
+    """Compile all that a node calls, in both modes, and print where the machine code is."""
     from eskf_ros.compiled import CACHE_FOLDER, COMPILED, sentence_on_compiling, while_compiling
 
     def say(text: str) -> None:
@@ -76,7 +76,7 @@ def _create() -> Any:
     try:
         return EskfNode()
     except (ParameterException, RuntimeError) as error:
-        # rclpy's own parameters, such as those of qos_overrides, and names that cannot be.
+        # Wrong parameters of rclpy itself, such as qos_overrides, and invalid names.
         raise StartError(error) from error
 
 

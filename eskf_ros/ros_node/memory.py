@@ -1,4 +1,4 @@
-"""The file that carries biases, place and heading from one run of the node to the next."""
+"""The warm start file: biases, place and heading from one run of the node to the next."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LARGEST_FLOAT = sys.float_info.max
 
 
 def write_memory(path: Path, memory: Memory) -> None:
-    """Write the file as a whole or not at all: a robot may lose its power at any moment. Raises OSError."""
+    """Write the file completely or not at all: a robot may lose its power at any moment. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     try:
@@ -37,12 +37,12 @@ def write_memory(path: Path, memory: Memory) -> None:
 
 
 def read_memory(path: Path) -> Memory | None:
-    """Read the file; None when there is none. Raises ValueError saying what is wrong with it."""
+    """Read the file; return None if there is none. Raises ValueError, which says what is wrong with it."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return None
-    # Brackets by the thousand are a RecursionError.
+    # JSON with thousands of nested brackets raises RecursionError.
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} cannot be read: {error}") from error
     try:
@@ -76,7 +76,7 @@ def _value(name: str, given: object) -> Any:
 
 
 def _is_finite(value: object) -> bool:
-    """Whether it is a number that a float can hold; an integer of JSON may be larger, and True is an int too."""
+    """Return whether it is a number that a float can hold: an integer of JSON may be larger, and True is an int."""
     return isinstance(value, int | float) and not isinstance(value, bool) and -LARGEST_FLOAT <= value <= LARGEST_FLOAT
 
 
@@ -94,11 +94,11 @@ class WarmStart:
 
     @property
     def is_waiting(self) -> bool:
-        """Whether there is a memory that was not offered yet."""
+        """Whether there is a memory that has not been offered yet."""
         return self._memory is not None
 
     def offer(self, navigator: Navigator, stamp: int) -> None:
-        """Give the estimator what the last run knew, if that is not too old at the first IMU sample (ns)."""
+        """Offer the memory to the estimator, unless it is too old at the first IMU sample (``stamp``, ns)."""
         assert self._memory is not None
         age = (stamp - self._memory.stamp) / SECOND
         if 0.0 <= age <= self._parameters.max_age:
@@ -109,6 +109,6 @@ class WarmStart:
         self._memory = None
 
     def write(self, navigator: Navigator) -> None:
-        """Write what is known now to the file, if there is one."""
+        """Write the present memory to the file, if there is one."""
         if self._parameters.file and navigator.memory is not None:
             write_memory(Path(self._parameters.file).expanduser(), navigator.memory)

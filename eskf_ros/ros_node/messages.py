@@ -1,4 +1,4 @@
-"""The messages the node sends seldom: biases, the filtered fix, the verdicts."""
+"""Messages that the node sends rarely: biases, the filtered fix, the verdicts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.gnss.point_solution import PointSolution, SolutionStatus
 
 GOOD_VERDICTS = (Verdict.FUSED, Verdict.WEIGHED_DOWN, Verdict.DUPLICATE, Verdict.DISABLED)
-"""Nothing is wrong with what got one of these."""
+"""Verdicts that are no fault of the measurement."""
 
 SIGNALS = (Stream.PSEUDORANGE, Stream.RANGE_RATE)
 """Streams whose sources are signals of satellites."""
@@ -31,12 +31,12 @@ def set_header(header: Any, stamp: int, frame: str) -> None:
 
 
 def key_values(values: dict[str, object]) -> list[KeyValue]:
-    """Turn a mapping into the form diagnostics have."""
+    """Return a mapping in the form of diagnostics."""
     return [KeyValue(key=key, value=str(value)) for key, value in values.items()]
 
 
 def bias_message(row: np.void, frame: str) -> TwistWithCovarianceStamped:
-    """Biases in the axes of the IMU, whose frame it is: linear m/s2 of the accelerometer, angular rad/s of the gyro."""
+    """Return the biases in the axes and frame of the IMU: linear accelerometer (m/s2), angular gyro (rad/s)."""
     message = TwistWithCovarianceStamped()
     set_header(message.header, int(row["stamp"]), frame)
     linear, angular = message.twist.twist.linear, message.twist.twist.angular
@@ -48,7 +48,7 @@ def bias_message(row: np.void, frame: str) -> TwistWithCovarianceStamped:
 
 
 def fix_message(row: np.void, datum: tuple[float, float, float], frame: str) -> NavSatFix:
-    """The position of base_link as NavSatFix, covariance in east, north, up of the map."""
+    """Return the position of base_link as NavSatFix, covariance in east, north, up of the map."""
     message = NavSatFix()
     set_header(message.header, int(row["stamp"]), frame)
     message.status.status = NavSatStatus.STATUS_FIX
@@ -59,7 +59,7 @@ def fix_message(row: np.void, datum: tuple[float, float, float], frame: str) -> 
 
 
 def solution_message(solution: PointSolution, stamp: int, frame: str) -> NavSatFix:
-    """The position of the antenna by the ranges of one epoch alone, in the frame of the message they came in."""
+    """Return the position of the antenna by the ranges of one epoch alone, in the frame of their message."""
     message = NavSatFix()
     set_header(message.header, stamp, frame)
     if solution.status != SolutionStatus.SOLVED:
@@ -75,7 +75,7 @@ def solution_message(solution: PointSolution, stamp: int, frame: str) -> NavSatF
 
 
 def record_statuses(records: np.ndarray, stamp: Time) -> DiagnosticArray:
-    """One status per measurement: what became of it, and which receiver (0 the first) or which signal it is from."""
+    """Return one status per measurement: its verdict, and its receiver (0: the first) or signal."""
     message = DiagnosticArray()
     message.header.stamp = stamp
     for record in records:

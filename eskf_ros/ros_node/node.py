@@ -43,17 +43,17 @@ from eskf_ros.ros_node.subscriptions import AidInput, open_inputs
 from eskf_ros.ros_node.warm_up import compile_node
 
 INPUT_DEPTH = 1000
-"""A second of a fast IMU: what may wait while the computer is busy elsewhere."""
+"""IMU messages that may wait while the computer is busy elsewhere: a second of a fast IMU."""
 
 REPORT_PERIOD = 1.0
-"""Seconds from one report to the next, and from one word about compiling to the next."""
+"""s; time from one report to the next."""
 
 WATCH_EVERY = 10
-"""Reports from one look for a second publisher of our transforms to the next."""
+"""Reports from one check for a second publisher of our transforms to the next."""
 
 
 class EskfNode(Node):
-    """Subscribes to the IMU and its aids; publishes odometry for every IMU sample, diagnostics once a second.
+    """Subscribes to IMU and other sensors; publishes odometry for every IMU sample, diagnostics once a second.
 
     A message that cannot be used is counted and named in the diagnostics; it never ends the node.
     """
@@ -106,7 +106,7 @@ class EskfNode(Node):
             callback = partial(self._on_aid, source, source.kind.push_of(self.navigator, self.range_intake))
             quality = input_qos(source.kind.depth)
             self._subscribe(source.message_class, source.name, quality, callback, source.kind.name, source.kind)
-        # A command is not one of many samples: it must not get lost, and the tools that send it are reliable.
+        # A command must not get lost, unlike one of many samples; the tools that send it are reliable.
         self._subscribe(
             PoseWithCovarianceStamped, topics.initial_pose, QoSProfile(depth=1), self._on_initial_pose, "initial_pose"
         )
@@ -116,19 +116,19 @@ class EskfNode(Node):
         self.create_service(Trigger, "~/set_datum_here", self._served(self._on_set_datum_here))
         if robot_localization.services is not None:
             robot_localization.RobotLocalizationServices(self, self.navigator, self.parameters.frames.map)
-        # Not on the clock of the node: a simulation that has not begun is worth a report too.
+        # Not on the clock of the node: reports also come before a simulation has begun.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(REPORT_PERIOD, self._contained(self._report, "report"), clock=steady)
         for name in unused_overrides(self):
             self.get_logger().warn(f"parameter {name} belongs to nothing here and has no effect")
-        # What was made so far stays: looking through it for garbage would take longer than the IMU waits.
+        # All objects so far stay: collecting garbage among them would take longer than an IMU interval.
         gc.collect()
         gc.freeze()
         self.get_logger().info("ready: listening to " + ", ".join(monitor.label for monitor in self.monitors))
 
     @property
     def monitors(self) -> list[StampMonitor]:
-        """What watches the stamps of the inputs, that of the IMU first."""
+        """The stamp monitors of the inputs, that of the IMU first."""
         return [self.imu_monitor, *(monitor for source in self.aid_inputs for monitor in source.monitors)]
 
     def close(self) -> None:
@@ -137,7 +137,7 @@ class EskfNode(Node):
         self._contained(partial(self._warm_start.write, self.navigator), "warm_start.file")()
 
     def _compile(self) -> None:
-        """Have every kernel compiled before the first message comes: from the cache, or anew for a minute."""
+        """Compile every kernel before the first message comes, or load it from the cache."""
         log = self.get_logger().info
         log("starting the estimator; the first start after an installation compiles it, which takes a minute")
         with while_compiling(sentence_on_compiling(log)):
@@ -155,7 +155,7 @@ class EskfNode(Node):
         name: str,
         kind: Input | None = None,
     ) -> None:
-        # All come serialised: a message that cannot be read fails in our callback, not in the executor.
+        # All messages come serialised: an unreadable one fails in our callback, not in the executor.
         contained = self._contained(callback, name)
         subscription = self.create_subscription(
             message_class, topic, contained, quality, raw=True, qos_overriding_options=OVERRIDING
@@ -163,7 +163,7 @@ class EskfNode(Node):
         self.inputs.append((subscription, kind))
 
     def _contained(self, callback: Callable[..., None], name: str) -> Callable[..., None]:
-        """Let no message and no mistake of ours end the node: count it by name, log it, go on."""
+        """Return the callback such that no error ends the node: errors are counted by name and logged."""
 
         def contain(*arguments: Any) -> None:
             try:
@@ -174,7 +174,7 @@ class EskfNode(Node):
         return contain
 
     def _served(self, callback: Callable[[], tuple[bool, str]]) -> Callable[..., Trigger.Response]:
-        """Answer a Trigger with what a callback returns, or with its error."""
+        """Return a handler that answers a Trigger with the result of a callback, or with its error."""
 
         def serve(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
             try:
@@ -195,7 +195,7 @@ class EskfNode(Node):
 
     def now(self) -> int:
         """Time of the node's clock (ns)."""
-        # The clock of the node costs more than the filter; without simulated time it is the system's.
+        # Reading the node's clock costs more than the filter; without simulated time it is the system clock.
         return int(self.get_clock().now().nanoseconds) if self._is_simulated else time.time_ns()
 
     def _reset(self, why: str) -> None:
@@ -238,7 +238,7 @@ class EskfNode(Node):
             self.longest_callback = took
 
     def _open_ranges(self) -> RangeIntake | None:
-        """Make ready for ranges, if GNSS is used by them."""
+        """Prepare the intake of ranges, if ranges are used. Raises ParameterError for unreadable RINEX files."""
         if not uses_ranges(self.parameters):
             return None
         self._solutions = self._publisher(NavSatFix, "gnss/point_solution")
@@ -276,9 +276,9 @@ class EskfNode(Node):
             self._is_judging = True
 
     def _tell_verdicts(self) -> None:
-        """Publish what became of the measurements up to the newest sample; later messages may still change it.
+        """Publish the verdicts of the measurements up to the newest sample; later messages may still change them.
 
-        Somebody who begins to listen is told what the history holds.
+        A new subscriber gets the verdicts of the whole history window.
         """
         if self._aids.get_subscription_count():
             records = self.navigator.take_live()
@@ -287,7 +287,7 @@ class EskfNode(Node):
         self._is_judging = self.navigator.waiting > 0
 
     def _report(self) -> None:
-        """Once a second: final verdicts, biases, filtered fix, diagnostics, other publishers of our transforms."""
+        """Publish final verdicts, biases, filtered fix and diagnostics; called once a second."""
         self._is_simulated = bool(self.get_parameter("use_sim_time").value)
         records = self.navigator.take_records()
         self._count(records)
@@ -319,7 +319,7 @@ class EskfNode(Node):
         self._reports += 1
 
     def _snapshot(self) -> Snapshot:
-        """What the diagnostics look at."""
+        """Return what the diagnostics report."""
         return Snapshot(
             graph=self,
             now=self.now(),
@@ -343,7 +343,7 @@ class EskfNode(Node):
         )
 
     def _count(self, records: np.ndarray) -> None:
-        """Count final verdicts by stream, those of the last fixes or pseudoranges apart."""
+        """Count final verdicts by stream, and separately those of the last fixes or pseudoranges."""
         positions: dict[Verdict, int] = {}
         for stream, verdict in zip(records["stream"].tolist(), map(Verdict, records["verdict"].tolist())):
             self.verdicts[stream, verdict] = self.verdicts.get((stream, verdict), 0) + 1
@@ -373,7 +373,7 @@ class EskfNode(Node):
             self.get_logger().info(f"{self.parameters.topics.initial_pose}: the estimate was put there")
 
     def _open_transform_inputs(self) -> None:
-        """Listen to static transforms for the places of the sensors, and to another node's odom -> base_link."""
+        """Subscribe to static transforms for the places of the sensors, and to another node's odom -> base_link."""
         if transforms.TFMessage is None:
             return
         if self.parameters.frames.extrinsics == "auto":
@@ -390,7 +390,7 @@ class EskfNode(Node):
         )
 
     def _watch_transforms(self) -> None:
-        """Look now and then, for one report's time, who else publishes our transforms: all the time costs too much."""
+        """Check from time to time, for one report period, who else publishes our transforms: always costs too much."""
         output = self.outputs.transforms
         if output is None:
             return
@@ -412,7 +412,7 @@ class EskfNode(Node):
         self._complete_extrinsics(is_late=True)
 
     def _meet_frame(self, met: set[Any], key: object, place: str, frame: str) -> None:
-        """Take note of a frame name that an input has not used before."""
+        """Record a frame name that an input has not used before."""
         if len(met) > 100:
             return
         met.add(key)
@@ -421,7 +421,7 @@ class EskfNode(Node):
             self._complete_extrinsics(is_late=not is_first)
 
     def _complete_extrinsics(self, is_late: bool) -> None:
-        """Use the places that can be found now; start again if earlier messages were taken for those of elsewhere."""
+        """Use the places that can be found now; reset if earlier messages were used with other places."""
         found = self.extrinsics.find()
         for line in found:
             self.get_logger().info(line)
@@ -432,5 +432,5 @@ class EskfNode(Node):
 
 
 def input_qos(depth: int) -> QoSProfile:
-    """Best effort matches every publisher, reliable ones too."""
+    """Return the quality of service of an input: best effort matches every publisher, reliable ones, too."""
     return QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)

@@ -1,4 +1,4 @@
-"""From a row of the estimator to the numbers of both odometry messages, in the order the messages have."""
+"""Numbers of both odometry messages from a row of the estimator, in the order of the message."""
 
 from __future__ import annotations
 
@@ -9,16 +9,19 @@ from eskf_ros.ros_node.two_d import PLANAR_VARIANCE
 
 GLOBAL, LOCAL = 0, 1
 NUMBERS = 85
-"""Position x y z, orientation x y z w, pose covariance (36), linear and angular velocity, twist covariance (36)."""
+"""Numbers of an odometry: position x y z, orientation x y z w, pose covariance (36), linear and angular velocity, twist
+covariance (36).
+"""
 
 ORIENTATION, POSE_COVARIANCE, LINEAR, TWIST_COVARIANCE = 3, 7, 43, 49
 
 
 @njit
 def fill_odometry(rows, index, is_planar, numbers):
-    """Fill ``numbers`` (2, 85) from one row (ODOMETRY): the pose in map, and the one in odom; False if not all finite.
+    """Fill ``numbers`` (2, 85) from one row (ODOMETRY): pose in map and pose in odom; return whether all are finite.
 
-    The pose covariance in odom is what was gathered since its start; roll and pitch are those of the estimate.
+    The pose covariance in odom is what has been gathered since its start; roll and pitch are those of the estimate.
+    ``is_planar``: the height has no uncertainty.
     """
     row = rows[index]
     for k in range(3):

@@ -12,28 +12,28 @@ from types import FrameType
 from typing import Any
 
 LONGEST_WAIT = 0.1
-"""The loop looks at the stop flag at least this often (s)."""
+"""s; the loop checks the stop flag at least this often."""
 
 
 class Stopped(BaseException):
-    """A signal came while the node was being made; like KeyboardInterrupt no error, so nobody takes it for one."""
+    """A signal came while the node was being made; no error, like KeyboardInterrupt, so that no handler catches it."""
 
 
 class StartError(Exception):
-    """The node cannot start with what it was given; the text is one line for the user."""
+    """The node cannot start with the given arguments; the text is one line for the user."""
 
     def __init__(self, error: Exception) -> None:
-        # Where in the sources of rcl it was found says nothing to the user.
+        # The place in the sources of rcl does not help the user.
         super().__init__(re.sub(r",? at /\S+:\d+", "", " ".join(str(error).split())))
 
 
 class StopFlag:
-    """Becomes set by SIGINT or SIGTERM, and nothing else happens: the loop ends where it is safe to end.
+    """Is set by SIGINT or SIGTERM, without any other effect: the loop ends where it is safe to end.
 
     Only while the node is being made, which may take a minute of compiling, `Stopped` is raised.
 
-    The handlers of rclpy shut the context down under the running callback instead, which then fails with a traceback.
-    A second signal (`ros2 launch` sends SIGINT to the group and to the process) changes nothing.
+    The handlers of rclpy shut the context down under the running callback instead, which then fails with a traceback. A
+    second signal (`ros2 launch` sends SIGINT to the group and to the process) changes nothing.
     """
 
     SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -51,13 +51,13 @@ class StopFlag:
             raise Stopped
 
     def ignore_from_now(self) -> None:
-        """Signals that arrive while the interpreter itself ends would still spoil the exit code."""
+        """Ignore signals from now on: while the interpreter ends they would spoil the exit code."""
         for number in self.SIGNALS:
             signal.signal(number, signal.SIG_IGN)
 
 
 def make_executor(context: Any = None) -> Any:
-    """The quickest single-threaded executor this rclpy has; drive it with `spin_once`.
+    """Return the quickest single-threaded executor of this rclpy; drive it with `spin_once`.
 
     The events executor takes a third of the processor time of the other, but its own `spin` delivers nothing in the
     releases of 2025 and 2026. Older Jazzy installations do not have it.
@@ -72,7 +72,7 @@ def make_executor(context: Any = None) -> Any:
 
 
 def spin(node: Any, stop: StopFlag) -> None:
-    """Serve the node until the flag is set or its context is shut down; what a callback raises comes out here."""
+    """Serve the node until the flag is set or its context is shut down; exceptions of a callback are raised here."""
     executor = make_executor(node.context)
     executor.add_node(node)
     try:
@@ -84,11 +84,11 @@ def spin(node: Any, stop: StopFlag) -> None:
 
 
 def run(create_node: Callable[[], Any], stop: StopFlag, arguments: Sequence[str] | None = None) -> None:
-    """The life of a process with one node: initialise rclpy, create the node, serve it, take everything down.
+    """Run a process with one node: initialise rclpy, create the node, serve it, shut everything down.
 
     `arguments` as of `rclpy.init` (None: those of the process). At the end, and also after an error, the node's
-    `close()` is called while its publishers still work, then its `destroy_node()`. Raises StartError for arguments
-    that rcl cannot read.
+    `close()` is called while its publishers still work, then its `destroy_node()`. Raises StartError for arguments that
+    rcl cannot read.
     """
     import rclpy
     from rclpy.signals import SignalHandlerOptions

@@ -1,4 +1,4 @@
-"""What the node publishes for every IMU sample: both odometries and the transforms."""
+"""Publishers for every IMU sample: both odometries and the transforms."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from eskf_ros.ros_node.two_d import flatten
 OUTPUT_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 
 ODOMETRY_QOS = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
-"""After a stall a second of the IMU is answered at once: what a subscriber missed of that has to be there still."""
+"""After a stall the node answers a second of IMU samples at once: the queue holds them until subscribers read them."""
 
 OVERRIDING = QoSOverridingOptions.with_default_policies()
 
@@ -30,8 +30,8 @@ class Outputs:
     """Publishes the rows of the estimator; nothing that is not finite leaves the node.
 
     Attributes:
-        published: rows that became odometry.
-        transforms: the output on /tf; None where it is off.
+        published: rows that were published as odometry.
+        transforms: the output on /tf; None if it is switched off.
     """
 
     def __init__(self, node: Node, parameters: Parameters, note_trouble: Callable[[str], None]) -> None:
@@ -53,7 +53,7 @@ class Outputs:
         self.transforms = self._open_transforms(parameters)
 
     def publish(self, rows: np.ndarray, index: int) -> None:
-        """Publish one of the ODOMETRY rows, which may be changed."""
+        """Publish row ``index`` of the ODOMETRY rows; the row may be changed."""
         self._rows += 1
         if self._rows % self._divisor:
             return
@@ -88,6 +88,6 @@ class Outputs:
                 "(install ros-jazzy-tf2-msgs, or set output.tf to none)"
             )
             return None
-        # What tf2's own broadcaster does: no more than volatile and reliable.
+        # Volatile and reliable, like the broadcaster of tf2.
         publisher: Any = self._node.create_publisher(transforms.TFMessage, "/tf", OUTPUT_QOS)
         return TransformOutput(mode, parameters.frames, publisher.publish)

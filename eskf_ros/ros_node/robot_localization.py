@@ -1,6 +1,7 @@
 """The services of robot_localization under their usual names, where that package is installed.
 
-navsat_transform's fromLL, toLL and datum, and the filter's set_pose: what was written for them goes on working.
+They are fromLL, toLL and datum of navsat_transform, and set_pose of the filter: clients written for them work
+unchanged.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ except ImportError:
 
 
 class RobotLocalizationServices:
-    """Serves FromLL, ToLL, SetDatum and SetPose for a navigator. Made only where `services` is not None.
+    """Serves FromLL, ToLL, SetDatum and SetPose for a navigator. Made only if `services` is not None.
 
-    The responses carry no success flag: where there is no answer yet the numbers are NaN, and the log says why.
+    The responses have no success flag: without an answer the numbers are NaN, and the log says why.
     """
 
     def __init__(self, node: Node, navigator: Navigator, map_frame: str) -> None:
@@ -41,7 +42,7 @@ class RobotLocalizationServices:
             node.create_service(kind, name, self._contained(name, answer))
 
     def _contained(self, name: str, answer: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-        """No request ends the node."""
+        """Return the service callback such that no request ends the node."""
 
         def contain(request: Any, response: Any) -> Any:
             try:

@@ -1,4 +1,4 @@
-"""A pose that somebody else knows: from the topic of RViz's tool and from the service of robot_localization."""
+"""A pose given from outside: by the topic of RViz's tool, or by the service of robot_localization."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from eskf_ros.ros_node.transforms import yaw_of
 
 
 def set_pose(navigator: Navigator, pose: Any) -> str:
-    """Put the estimate to a geometry_msgs/PoseWithCovariance in map; returns why not, or nothing.
+    """Set the estimate to a geometry_msgs/PoseWithCovariance in map; return why not, or an empty string.
 
-    x, y, z and yaw are taken over, roll and pitch stay. A height without variance, as tools that look at the map from
-    above send it, says nothing: the present one stays.
+    x, y, z and yaw are used, roll and pitch stay. A height without variance, as tools with a view from above send it,
+    is ignored: the present height stays.
     """
     p, q = pose.pose.position, pose.pose.orientation
     covariance = np.reshape(pose.covariance, (6, 6))

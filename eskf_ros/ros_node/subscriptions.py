@@ -1,4 +1,4 @@
-"""The rows of `eskf_ros.inputs.table` as topics of the node: each reads serialised messages one by one."""
+"""The inputs of `eskf_ros.inputs.table` as topics of the node: each reads serialised messages one by one."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from eskf_ros.ros_node.clocks import StampMonitor
 
 
 def message_class(type_name: str) -> Any:
-    """The class of a type such as sensor_msgs/msg/Imu. Raises ImportError where its package is not installed."""
+    """Return the class of a type such as sensor_msgs/msg/Imu. Raises ImportError if its package is not installed."""
     package, _, name = type_name.split("/")
     return getattr(importlib.import_module(f"{package}.msg"), name)
 
 
 class AidInput:
-    """One input: the messages of its topic, and what their stamps tell, for each receiver that sends on it.
+    """One input: the messages of its topic, and a stamp monitor for each receiver that sends on it.
 
     Attributes:
-        kind: the row.
-        name: of the topic, as the parameters have it.
+        kind: the input.
+        name: of the topic, as in the parameters.
         message_class: the chosen one, of rclpy.
-        monitors: of the first receiver, and of the second where there is one and it sends on this topic; none where
+        monitors: of the first receiver, and of the second where there is one and it sends on this topic; none if
             stamps are no instants of measurements.
     """
 
     def __init__(self, kind: Input, parameters: Parameters, topic: str) -> None:
-        """`topic`: the resolved name. Raises ParameterError when the message type is not installed."""
+        """Prepare the input; `topic`: the resolved name. Raises ParameterError if the message type is not installed."""
         self.kind = kind
         self._chosen = kind.of_type(getattr(parameters.topics, f"{kind.name}_type", kind.type))
         self.name: str = getattr(parameters.topics, kind.name)
@@ -57,36 +57,36 @@ class AidInput:
         self._offsets = [round(offset * SECOND) for offset in offsets]
 
     def read(self, data: bytes, arrival: int) -> Batch:
-        """One serialised message as a batch. Raises ValueError, or what rclpy raises, when it is none of this type."""
+        """Return one serialised message as a batch. Raises ValueError, or what rclpy raises, if it has another type."""
         batch = self._decoded(data, arrival)
         if batch is None:
-            # In another encoding, perhaps: the message library writes it anew in its own.
+            # It may have another encoding: the message library writes it again in its own.
             batch = self._decoded(serialize_message(deserialize_message(data, self.message_class)), arrival)
         if batch is None:
             raise ValueError(f"not a serialised {self._chosen.type}")
         return batch
 
     def arguments(self, batch: Batch) -> Arguments:
-        """What a batch gives to the push of this input."""
+        """Return the arguments for the push of this input, one tuple per message of a batch."""
         return self._chosen.arguments(batch)
 
     def _decoded(self, data: bytes, arrival: int) -> Batch | None:
-        # A table of its own for each message: names that never come again must not fill the memory.
+        # Each message has its own string table: names that never come again must not fill the memory.
         strings = StringTable()
         messages, valid = decode(self._chosen.type, np.frombuffer(data, np.uint8)[None], strings)
         return Batch(np.array([arrival]), messages, strings.values) if valid is None else None
 
     def receiver(self, frame: str) -> int:
-        """Which receiver a message with this frame is from: 0 the first, 1 the second."""
+        """Return which receiver has sent a message with this frame: 0 the first, 1 the second."""
         return int(self._second_frame != "" and frame == self._second_frame)
 
     def offset(self, receiver: int) -> int:
-        """What is added to the stamps of a receiver (ns)."""
+        """Return the time offset (ns) that is added to the stamps of a receiver."""
         return self._offsets[receiver]
 
 
 def open_inputs(parameters: Parameters, resolve: Callable[[str], str]) -> list[AidInput]:
-    """Every row in use, in the type that the parameters choose; `resolve` makes the full name of a topic."""
+    """Return every input in use, in the type that the parameters choose; `resolve` makes the full name of a topic."""
     return [
         AidInput(kind, parameters, resolve(getattr(parameters.topics, kind.name))) for kind in inputs_of(parameters)
     ]

@@ -27,7 +27,7 @@ Quaternion = tuple[float, float, float, float]
 
 
 def map_to_odom(row: np.void) -> tuple[Vector, Quaternion]:
-    """The pose of odom in map from one ODOMETRY row, which has the pose of base_link in both."""
+    """Return the pose of odom in map from one ODOMETRY row, which has the pose of base_link in both."""
     w, x, y, z = row["attitude_body_to_map"].tolist()
     wo, xo, yo, zo = row["attitude_body_to_odom"].tolist()
     # The two attitudes differ by a turn about z only.
@@ -36,7 +36,7 @@ def map_to_odom(row: np.void) -> tuple[Vector, Quaternion]:
 
 
 def turned_by(yaw: float, position_map: Vector, position_odom: Vector) -> tuple[Vector, Quaternion]:
-    """The pose of odom in map when it is turned by `yaw` and both positions (m) are those of one point."""
+    """Return the pose of odom in map, turned by `yaw` (rad), such that both positions (m) are the same point."""
     cosine, sine = math.cos(yaw), math.sin(yaw)
     x, y, z = position_odom
     translation = (
@@ -48,20 +48,21 @@ def turned_by(yaw: float, position_map: Vector, position_odom: Vector) -> tuple[
 
 
 def yaw_of(w: float, x: float, y: float, z: float) -> float:
-    """The yaw (rad) of a quaternion."""
+    """Return the yaw (rad) of a quaternion."""
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 class Track:
-    """The way of base_link in map over the last seconds: x, y, z and yaw at any stamp in between."""
+    """The path of base_link in map over the last seconds: x, y, z and yaw at any stamp in between."""
 
     LENGTH = 4000
+    """Points of the path that are kept, at most."""
 
     def __init__(self) -> None:
         self._points: deque[tuple[int, Vector, float]] = deque(maxlen=self.LENGTH)
 
     def note(self, row: np.void) -> None:
-        """Take note of one ODOMETRY row, newer than all before; an older one begins a new track."""
+        """Add one ODOMETRY row, newer than all before; an older one begins a new path."""
         stamp = int(row["stamp"])
         if self._points and stamp <= self._points[-1][0]:
             self._points.clear()
@@ -73,7 +74,7 @@ class Track:
         return self._points[-1][0] if self._points else 0
 
     def at(self, stamp: int) -> tuple[Vector, float] | None:
-        """Position (m) and yaw (rad) at a stamp (ns) between the first and the last row, else None."""
+        """Return position (m) and yaw (rad) at a stamp (ns) between the first and the last row, else None."""
         after = None
         for point in reversed(self._points):
             if point[0] <= stamp:
@@ -89,9 +90,9 @@ def _between(a: tuple[int, Vector, float], b: tuple[int, Vector, float], stamp: 
 
 
 class TransformOutput:
-    """Publishes the transforms of each row, in the way `output.tf` says.
+    """Publishes the transforms of each row as `output.tf` demands.
 
-    Made only where tf2_msgs is (`TFMessage` is not None). `publish` sends a TFMessage on /tf.
+    Made only if tf2_msgs is there (`TFMessage` is not None). `publish` sends a TFMessage on /tf.
     """
 
     def __init__(self, mode: str, frames: Frames, publish: Callable[[Any], None]) -> None:
@@ -111,7 +112,7 @@ class TransformOutput:
         self.watch = TransformWatch({child: parent for parent, child in pairs})
 
     def send(self, row: np.void) -> None:
-        """Publish what one ODOMETRY row tells."""
+        """Publish the transforms of one ODOMETRY row."""
         if self._mode == "map_to_odom":
             if row["position_known"]:
                 self._track.note(row)
@@ -124,7 +125,7 @@ class TransformOutput:
         self._publish(self._message if row["position_known"] else self._local_message)
 
     def receive(self, message: Any) -> None:
-        """Take a TFMessage: what another node says of odom -> base_link, and who else publishes what is ours."""
+        """Take a TFMessage: another node's odom -> base_link, and evidence of a second publisher of our transforms."""
         for transform in message.transforms:
             stamp = transform.header.stamp.sec * SECOND + transform.header.stamp.nanosec
             t, q = transform.transform.translation, transform.transform.rotation
@@ -137,7 +138,7 @@ class TransformOutput:
                     self._answer()
 
     def _answer(self) -> None:
-        """Publish map -> odom for the odometry of another node, as soon as the estimate has reached its stamp."""
+        """Publish map -> odom for the odometry of another node, once the estimate has reached its stamp."""
         if self._waiting is None or self._waiting[0] > self._track.newest:
             return
         stamp, position_odom, yaw_odom = self._waiting
@@ -158,39 +159,39 @@ class TransformOutput:
 
 
 class TransformWatch:
-    """Tells own transforms on /tf from those of a second publisher of the same frames."""
+    """Distinguishes our own transforms on /tf from those of a second publisher of the same frames."""
 
     ENOUGH = 300
-    """Transforms looked at in one watch: not to spend the processor on our own."""
+    """Transforms that are examined in one watch, at most, to save processor time."""
 
     def __init__(self, parents: dict[str, str]) -> None:
-        """`parents`: the parent of each frame whose transform we publish."""
+        """Make a watch; `parents`: the parent of each frame whose transform we publish."""
         self._parents = parents
         self._sent: dict[tuple[str, int], float] = {}
         self._looked_at = self.ENOUGH
         self._strangers: set[str] = set()
         self.strangers: tuple[str, ...] = ()
-        """What the last complete watch has found: `parent -> child`."""
+        """Transforms of a second publisher in the last complete watch: `parent -> child`."""
 
     def begin(self) -> None:
-        """Begin a watch; only what is sent from now on counts as known."""
+        """Begin a watch; only transforms sent from now on are known as our own."""
         self._sent.clear()
         self._strangers = set()
         self._looked_at = 0
 
     def end(self) -> None:
-        """End a watch and take over what it has found."""
+        """End a watch and keep its result."""
         if self._looked_at:
             self.strangers = tuple(sorted(self._strangers))
         self._looked_at = self.ENOUGH
 
     def note_sent(self, child: str, stamp: int, x: float) -> None:
-        """Take note of a transform of our own: stamp (ns) and translation in x (m) tell it."""
+        """Record a transform of our own, identified by stamp (ns) and translation in x (m)."""
         if self._looked_at < self.ENOUGH:
             self._sent[child, stamp] = x
 
     def note_received(self, parent: str, child: str, stamp: int, x: float) -> None:
-        """Take note of a transform that was seen on /tf."""
+        """Record a transform that was seen on /tf."""
         if child not in self._parents or self._looked_at >= self.ENOUGH:
             return
         self._looked_at += 1

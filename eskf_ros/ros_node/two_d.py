@@ -1,4 +1,4 @@
-"""What a planar robot is told: nothing of height, roll and pitch."""
+"""Output of a planar robot (``output.two_d``): height, roll and pitch are zero and known."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ PLANAR = (2, 3, 4)
 """Indices of z, roll and pitch in the covariances of messages."""
 
 PLANAR_VARIANCE = 1e-6
-"""m2 and rad2: zero would leave others a matrix without inverse."""
+"""m2 and rad2; variance of the suppressed axes: zero would make the matrix singular."""
 
 
 def flatten(row: np.void) -> None:

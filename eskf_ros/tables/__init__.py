@@ -1,1 +1,1 @@
-"""Tables in and out of the filter for arrays in memory (`eskf_ros.api`)."""
+"""Tables for arrays in memory (`eskf_ros.api`): input columns, results, and recordings as tables."""

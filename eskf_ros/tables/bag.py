@@ -1,4 +1,4 @@
-"""A recording as tables for `eskf_ros.run`: what its topics carry, as columns."""
+"""A recording as tables for `eskf_ros.run`: the content of its topics as columns."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from eskf_ros.replay.topics import IMU, find_topics
 Table = dict[str, NDArray[Any]]
 
 READ = {row.stream: row for row in ROWS}
+"""Rows of the measurements by stream."""
 
 
 def read_bag(path: str | PathLike[str], parameters: Parameters | None = None) -> dict[str, Table]:
     """Return the inputs of a recording as tables, by the names that `eskf_ros.run` takes.
 
-    ``path``: a rosbag2 folder, an .mcap or a .db3 file. ``parameters``: their topics are read, by default those of the
-    default parameters; a topic that is not there is left out. Ranges of satellites are not read: for these there is
-    ``eskf_replay``.
+    ``path``: a rosbag2 folder, an .mcap or a .db3 file. ``parameters``: name the topics to read (default: the default
+    parameters); a missing topic is left out. Ranges of satellites are not read: use ``eskf_replay`` for them.
 
     Raises:
         BagError: the recording cannot be read.
@@ -56,7 +56,7 @@ def read_bag(path: str | PathLike[str], parameters: Parameters | None = None) ->
 
 
 def _table(row: Row, messages: NDArray[Any]) -> Table:
-    """The columns of one kind of measurement."""
+    """Return the columns of one kind of measurement."""
     if row.name == "gnss_position":
         unknown = messages["position_covariance_type"] == 0
         covariance = np.where(unknown[:, None], 0.0, messages["position_covariance"])

@@ -15,13 +15,13 @@ Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
 SMALLEST_NANOSECONDS = 10**12
-"""Integers below are taken for seconds or milliseconds."""
+"""Smaller integers are taken for seconds or milliseconds."""
 
 LARGEST_SECONDS = 1e11
-"""Floating point numbers above are taken for nanoseconds."""
+"""Larger floating point numbers are taken for nanoseconds."""
 
 SHORTEST_STEP = 100_000
-"""Integers that usually follow each other more closely (ns) are milliseconds or microseconds."""
+"""ns; integers whose median step is shorter are taken for milliseconds or microseconds."""
 
 
 class Table:
@@ -47,11 +47,11 @@ class Table:
         return column in self._names
 
     def unused(self) -> list[str]:
-        """The columns that nobody has asked for."""
+        """Return the columns that have not been read."""
         return [column for column in self._names if column not in self._used]
 
     def stamps(self) -> Stamps:
-        """The stamps as int64 ns (n,)."""
+        """Return the stamps as int64 ns (n,). Raises ValueError if they are missing or ambiguous."""
         self._require("stamp")
         self._used.add("stamp")
         found = np.asarray(self._source["stamp"])
@@ -64,18 +64,21 @@ class Table:
         return nanoseconds(self._name, found)
 
     def scalar(self, column: str, count: int) -> Array:
-        """A column (n,)."""
+        """Return a column as float64 (n,). Raises ValueError for another shape or type."""
         return self._numbers(column, count, ((),))
 
     def vector(self, column: str, count: int) -> Array:
-        """A vector (n, 3), of one column or of three."""
+        """Return a vector as float64 (n, 3), from one column or three. Raises ValueError for another shape or type."""
         parts = [f"{column}_{axis}" for axis in "xyz"]
         if not self.has(column) and any(self.has(part) for part in parts):
             return np.column_stack([self.scalar(part, count) for part in parts])
         return self._numbers(column, count, ((3,),))
 
     def covariance(self, axes: tuple[str, ...], count: int, one_unit: bool) -> Array | None:
-        """Covariances (n, k, k) of k axes; None when there is no such column."""
+        """Return covariances (n, k, k) of k axes; None without such a column. Raises ValueError for another shape.
+
+        ``one_unit``: a single variance may stand for all axes.
+        """
         size = len(axes)
         parts = [f"covariance_{axis}" for axis in axes]
         if not self.has("covariance"):
@@ -99,7 +102,7 @@ class Table:
             )
 
     def _numbers(self, column: str, count: int, shapes: tuple[tuple[int, ...], ...]) -> Array:
-        """A column as float64, its rows in one of the shapes."""
+        """Return a column as float64 whose rows have one of the shapes."""
         self._require(column)
         self._used.add(column)
         found = np.asarray(self._source[column])
@@ -114,7 +117,7 @@ class Table:
 
 
 def nanoseconds(name: str, stamps: NDArray[Any]) -> Stamps:
-    """Stamps (n,) as int64 ns; raises ValueError where it is not certain what they are."""
+    """Return stamps (n,) as int64 ns; raises ValueError if their unit is not certain."""
 
     def refuse(row: int, why: str) -> ValueError:
         return ValueError(f"{name}: the column stamp holds {stamps[row]} in row {row}, {why}")
@@ -157,7 +160,7 @@ def nanoseconds(name: str, stamps: NDArray[Any]) -> Stamps:
 
 
 def in_order(parts: Iterable[tuple[Stamps, Array]], width: int) -> tuple[Stamps, Array]:
-    """All parts as one, by stamp and then by content: in whatever order they came."""
+    """Return all parts joined, sorted by stamp and then by content, independent of the order in which they came."""
     parts = list(parts)
     stamps = np.concatenate([np.zeros(0, np.int64), *(part for part, _ in parts)])
     rows = np.concatenate([np.zeros((0, width)), *(part for _, part in parts)])

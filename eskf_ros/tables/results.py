@@ -1,4 +1,4 @@
-"""What a filter found, as tables: DataFrames where pandas is installed, else structured arrays."""
+"""Results of a filter as tables: DataFrames if pandas is installed, else structured arrays."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from eskf_ros.replay.summary import CHI_SQUARE_95, counted, named
 
 
 def aid_summary(records: NDArray[Any]) -> dict[str, Any]:
-    """Counts and consistency of the records (n,) of one stream."""
+    """Return counts and consistency of the records (n,) of one stream."""
     counts = np.bincount(records["verdict"], minlength=len(Verdict))
     tested = records[np.isfinite(records["nis"])]
     inside = tested["nis"] <= CHI_SQUARE_95[tested["dof"]]
@@ -28,6 +28,7 @@ def aid_summary(records: NDArray[Any]) -> dict[str, Any]:
 
 
 def trajectory_table(rows: NDArray[Any], datum: tuple[float, float, float] | None) -> Any:
+    """Return the trajectory of ODOMETRY rows (n,) as a table; columns as in `eskf_ros.Result`."""
     known = rows["position_known"]
     geodetic = np.full((len(rows), 3), math.nan)
     if datum is not None and known.any():
@@ -54,6 +55,7 @@ def trajectory_table(rows: NDArray[Any], datum: tuple[float, float, float] | Non
 
 
 def innovation_table(records: NDArray[Any]) -> Any:
+    """Return the innovations of RECORD rows (n,) as a table; columns as in `eskf_ros.Result`."""
     return as_table(
         {
             "aid": np.array(STREAM_NAMES)[records["stream"]],
@@ -67,7 +69,7 @@ def innovation_table(records: NDArray[Any]) -> Any:
 
 
 def as_table(columns: dict[str, NDArray[Any]]) -> Any:
-    """A DataFrame with a column for each element of a vector; without pandas a structured array."""
+    """Return a DataFrame with a column for each element of a vector; without pandas a structured array."""
     try:
         import pandas  # type: ignore[import-untyped,import-not-found,unused-ignore]
     except ImportError:

@@ -1,11 +1,12 @@
-"""Start-up: level from gravity, position from the first fix, heading from what there is.
+"""First position: from the first fix, or from a pose that somebody sets.
 
-In this order: a parameter or the memory of the last run, a sensor that tells it (``heading_hints``), or acceleration
-(``heading_search``), sharpened by the course.
+The coarse alignment finds the level from gravity (`levelling`), then the position from the first fix, then the heading.
+The heading comes from a parameter or the memory of the last run (`heading`), from a sensor that measures it
+(`heading_sensors`), or from accelerations (`heading_search`), sharpened by the course.
 
-While the heading is unknown its error has the variance of a half turn and is not estimated: GNSS moves position and
-velocity only (``strapdown.step`` cuts the coupling), the gyros carry the attitude. Every still window until the
-heading is known levels again; once GNSS is there, only one in which a fix agrees that it is still.
+While the heading is unknown, its error has the variance of a half turn and is not estimated: GNSS corrects position and
+velocity only (`predict.step` cuts the coupling), and the gyros carry the attitude. Until the heading is known every
+still window levels again; after the first fix only one in which a fix or the wheels confirm rest.
 """
 
 from __future__ import annotations
@@ -19,12 +20,19 @@ from eskf_ros.filter.state.error_state import ERROR_CAPACITY, POSITION, VELOCITY
 from eskf_ros.geodesy.rotation import rotate, rotate_back, to_matrix
 
 START_POSITION_STD = 1000.0
+"""m per axis; prior of the position before the update by the first fix."""
+
 START_VELOCITY_STD = 100.0
+"""m/s per axis; prior of a velocity of which nothing is known."""
 
 
 @njit
 def reset_position_to_fix(state, payload):
-    """Take position from the first fix, with a wide prior that the update of this same fix makes narrow."""
+    """Set the position to the first fix, with a wide prior that the update by this same fix narrows.
+
+    ``payload`` starts with latitude, longitude (rad) and altitude (m) of the antenna. Without a datum the fix becomes
+    the datum.
+    """
     old_up = local_up(state)
     if state.frame.datum_known == 0:
         set_datum(state, payload[0], payload[1], payload[2])
@@ -47,7 +55,7 @@ def reset_position_to_fix(state, payload):
 
 @njit
 def reset_pose(state, position, position_covariance, heading, heading_std, settings):
-    """Put base_link to a position (m, map) with a covariance (3, 3) and a heading (rad), whatever was known before."""
+    """Set base_link to a position (m, map) with a covariance (3, 3) and a heading (rad), whatever was known before."""
     covariance = state.covariance
     for i in range(3):
         for j in range(ERROR_CAPACITY):

@@ -1,4 +1,4 @@
-"""The heading: what it is, setting it, and finding it by motion, by the course or from memory."""
+"""The heading: setting it, and finding it by search, by the course over ground, or from memory."""
 
 from __future__ import annotations
 
@@ -22,23 +22,32 @@ from eskf_ros.geodesy.earth import east_north_up_to_ecef, geodetic_to_ecef
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix, wrapped
 
 COURSE_MAX_STD = 0.17
+"""rad; the course over ground gives the heading only if its standard deviation is below this."""
+
 COURSE_MAX_TURN_RATE = 0.2
-"""Course over ground gives heading only when it is this certain (rad) and the robot turns no faster (rad/s)."""
+"""rad/s; the course over ground gives the heading only if the robot turns more slowly."""
 
 CERTAIN = 3.0
+"""Standard deviations within which search and course must agree, and by which forward must differ from reverse."""
+
 LEAST_LENGTH = 0.5
+"""Length of the found (cos, sin) along the course, at least; 1 if the model holds."""
+
 COURSE_SEARCH_STD = 0.35
-"""The course is believed when the search agrees within three sigma, and knows the direction so well by itself (rad)."""
+"""rad; standard deviation of the direction found by the search above which the course is not believed."""
 
 
 @njit
 def reset_heading(state, heading, std, settings):
-    """Turn the attitude about the local vertical to ``heading`` (rad), independent of everything else by ``std``."""
+    """Turn the attitude about the local vertical to ``heading`` (rad, map), with the standard deviation ``std`` (rad).
+
+    The error of the heading is uncorrelated with all others afterwards.
+    """
     up = local_up(state)
     lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[0])
     change = heading - heading_of(state, settings)
     reset_attitude(state, (change * up[0], change * up[1], change * up[2]))
-    # The vehicle did not make this turn.
+    # The vehicle did not make this turn: the error of the magnetic field stays the same.
     state.mag.heading = wrapped(state.mag.heading + change)
     covariance = state.covariance
     across = (
@@ -51,7 +60,7 @@ def reset_heading(state, heading, std, settings):
         for j in range(3):
             covariance[ATTITUDE + i, ATTITUDE + j] += up[i] * up[j] * std**2
     if state.position_known == 1:
-        # GNSS held the antenna in place: the body is on the other end of the lever arm.
+        # GNSS has measured the antenna, which therefore stays in place: the IMU moves about it.
         turned = rotate(to_matrix(state.attitude), settings.lever_arms_body[0])
         for i in range(3):
             state.position_map[i] += lever[i] - turned[i]
@@ -59,7 +68,7 @@ def reset_heading(state, heading, std, settings):
 
 @njit
 def search_heading(state, aid, gate, settings, work):
-    """Let a GNSS measurement that was fused take part in the search for the heading, and look whether it is over."""
+    """Update the search with a GNSS measurement that was fused; set the heading if the search has found it."""
     rotation = to_matrix(state.attitude)
     arm = settings.lever_arms_body[aid.source]
     if aid.stream == Stream.GNSS_POSITION:
@@ -81,9 +90,10 @@ def search_heading(state, aid, gate, settings, work):
 
 @njit
 def search_with(state, first, measured, lever, gate, settings, work):
-    """Search with a position (``first`` 0, m) or velocity (2, m/s) of the antenna, covariance in ``work.noise``.
+    """Update the search with a position (``first`` 0, m) or velocity (2, m/s) of the antenna; set a found heading.
 
-    ``measured`` in map, ``lever`` (or its velocity) in the axes of the unknown heading.
+    ``measured`` is in map, its covariance in ``work.noise``; ``lever``, the lever arm or its velocity, is in the level
+    axes of the unknown heading.
     """
     if state.search.started == 1:
         update_search(state, first, measured, lever, work.noise, gate, work)
@@ -100,10 +110,10 @@ def search_with(state, first, measured, lever, gate, settings, work):
 
 @njit
 def align_to_course(state, settings):
-    """Take the unknown heading from the course, if that is certain and steady and the search knows which end is ahead.
+    """Set the unknown heading to the course over ground, if that is certain and steady and the search confirms it.
 
-    Accelerations tell forward from reverse, and side slip from driving straight, long before they tell the heading as
-    well as the course does.
+    Accelerations tell forward from reverse, and side slip from straight travel, long before they tell the heading as
+    accurately as the course does.
     """
     v = state.velocity_map
     speed = math.sqrt(v[0] ** 2 + v[1] ** 2)
@@ -145,9 +155,9 @@ def align_to_course(state, settings):
 
 @njit
 def reset_heading_from_memory(state, payload, settings):
-    """Take the remembered heading if the first fix (``payload``: rad, rad, m, covariance) finds the robot in its place.
+    """Set the heading to the remembered one if the first fix finds the robot at its remembered place.
 
-    The state has level and position already.
+    ``payload``: latitude, longitude (rad), altitude (m), covariance. Level and position are known already.
     """
     if settings.has_memory == 0 or state.restarts > 0 or state.heading_known == 1:
         return

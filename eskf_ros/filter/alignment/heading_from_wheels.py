@@ -1,7 +1,7 @@
-"""Heading from wheels: which way the vehicle moves on the map while its wheels say that it rolls forward.
+"""Heading from wheels: the direction of motion on the map while the wheels measure forward motion.
 
-The slow robot with fixes of a metre accelerates too little for the search to see it. What its wheels measure is a
-velocity in axes that are level and turned by the unknown angle: one more measurement that is linear in cosine and sine.
+A slow robot whose fixes are accurate to a metre accelerates too little for the search. Its wheels measure a velocity in
+level axes that are turned by the unknown heading: one more measurement that is linear in cosine and sine.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from eskf_ros.filter.measurements.wheel import repeated
 from eskf_ros.geodesy.rotation import cross, rotate, to_matrix
 
 LEAST_SPEED = 0.7
-"""Slower wheels (m/s) tell no direction: counters of pulses read zero until the vehicle moves at 0.5 m/s."""
+"""m/s; slower wheels tell no direction: pulse counters read zero until the vehicle moves at 0.5 m/s."""
 
 SIDE_SLIP_TIME = 10.0
-"""Seconds for which the course differs from the heading by the same angle."""
+"""s; time for which the course differs from the heading by the same angle."""
 
 
 @njit
 def search_with_wheels(state, payload, gate, settings, work):
-    """Let the speed of the wheels (payload as in ``aiding.wheel``) take part in the search for the heading.
+    """Update the search for the heading with the speed of the wheels (payload as in `measurements.wheel`).
 
-    The velocity of the IMU on the map minus that of the wheels, turned by the unknown angle, is zero. Sideways the
-    vehicle moves by no more than its course differs from its heading.
+    The measurement: the velocity of the IMU on the map, minus the velocity of the wheels turned by the unknown heading,
+    is zero. Its noise contains the angle between course and heading (``settings.course_std``).
     """
     if state.heading_known == 1 or state.search.started == 0 or settings.use_course == 0 or payload[3] < 0.0:
         return

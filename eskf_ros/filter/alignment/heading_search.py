@@ -1,15 +1,15 @@
-"""Heading from acceleration: which way round the level frame of the gyros lies on the map.
+"""Heading search: the heading from accelerations, as a linear estimation problem.
 
-Levelled but without heading, the IMU knows every acceleration up to one unknown turn about the vertical. GNSS sees the
-same acceleration on the map. Written with the cosine and the sine of that turn as two states, the whole problem is
-linear: a Kalman filter of position and velocity in east and north, (cos, sin), and what tilt and accelerometer bias
-leave. Nothing has to be guessed: there are no hypotheses that could lock to the wrong one, no direction of travel is
-taken for granted (reversing, side slip, a multirotor), and a robot that has not accelerated has a (cos, sin) near zero,
-which says that nothing is known. Where the length comes out as one, the model holds.
+A levelled IMU without heading knows every acceleration up to one unknown turn about the vertical. GNSS observes the
+same acceleration on the map. With the cosine and the sine of that turn as two states the whole problem is linear: a
+Kalman filter of position and velocity in east and north, (cos, sin), and the acceleration errors from tilt and
+accelerometer bias. There are no hypotheses that could lock to a wrong heading, and no direction of travel is assumed
+(reversing, side slip, a multirotor). A robot that has not accelerated has a (cos, sin) near zero: nothing is known.
+Where the length of (cos, sin) comes out as one, the model holds.
 
 The error of the acceleration in east and north is tilt + R bias, with R the turn of the body since the gyros began.
-The level hides the bias in the tilt, tilt = -R bias then, and when the body turns the bias comes out. Turns about the
-vertical commute, so both are constant in east and north, whatever the unknown turn is.
+Levelling hides the bias in the tilt, tilt = -R bias; when the body turns, the bias shows. Turns about the vertical
+commute, so both are constant in east and north, whatever the unknown turn is.
 
 A uniform heading has mean (0, 0) and variance 1/2 in each of (cos, sin).
 """
@@ -26,7 +26,7 @@ from eskf_ros.geodesy.earth import STANDARD_GRAVITY
 from eskf_ros.geodesy.rotation import rotate
 
 SEARCH_SIZE = 10
-"""States of the search for the heading (see ``heading_search``)."""
+"""States of the search, two each: position (m), velocity (m/s), (cos, sin), tilt and accelerometer bias (m/s2)."""
 
 SEARCH = np.dtype(
     [
@@ -37,42 +37,49 @@ SEARCH = np.dtype(
     ],
     align=True,
 )
-"""The search for the heading.
-
-``estimate``: position, velocity, cosine and sine, tilt and accelerometer bias as accelerations; ``age``: seconds
-since the last level.
+"""The search for the heading: whether it has started, its states and their covariance, and the seconds since the last
+level (``age``).
 """
 
 COSINE = 4
+"""Index of (cos, sin) among the states."""
+
 TILT = 6
+"""Index of the acceleration errors from tilt, in east and north."""
+
 BIAS = 8
+"""Index of the horizontal accelerometer bias, along x and y of base_link turned into the level plane."""
 
 START_VELOCITY_STD = 30.0
-"""Of a robot at the first fix (m/s, per axis)."""
+"""m/s per axis; prior of the velocity at the first fix."""
 
 LEAST_ACCELERATION_STD = 0.01
-"""What Coriolis, scale factors and settling springs leave at least (m/s2)."""
+"""m/s2; least standard deviation of acceleration errors after levelling: Coriolis, scale factors, settling springs."""
 
 LEANING_TIME = 10.0
-"""A body that leans shows another part of its accelerometer bias, for about this long (s)."""
+"""s; a body that leans shows another part of its accelerometer bias for about this long."""
 
 LEAST_LEVEL = 0.1
-"""A body whose x axis is this upright (cosine) turns about it, not with it."""
+"""Horizontal length of the unit vector along the x axis of base_link below which the turn of the body is undefined: the
+body turns about this axis instead of turning it.
+"""
 
 LENGTH_TOLERANCE = 0.1
+"""The length of (cos, sin) must not differ from one by more than this plus three standard deviations."""
+
 LENGTH_STD = 0.25
-"""(cos, sin) has length one within this and three sigma, and that sigma is small: else the model does not hold."""
+"""The heading is undecided while the standard deviation of the length of (cos, sin) exceeds this."""
 
 
 @njit
 def forget_search(state):
-    """Begin anew with the next fix."""
+    """Stop the search, so that the next fix begins a new one."""
     state.search.started = 0
 
 
 @njit
 def begin_search(state, east, north, variance):
-    """Begin at a fix (m, map) of that variance per axis; nothing is known of velocity and heading."""
+    """Begin a search at a fix (m, map) with ``variance`` (m2) per axis; velocity and heading are unknown."""
     for i in range(TILT):
         state.search.estimate[i] = 0.0
         for j in range(SEARCH_SIZE):
@@ -102,9 +109,10 @@ def turn_of_body(rotation, settings):
 
 @njit
 def note_level(state, tilt_variance, accel_bias_variance, rotation, settings):
-    """A new level has this tilt variance (rad2) apart from the accelerometer bias, which it hides in the tilt.
+    """Reset the tilt of the search after a levelling, which hides the accelerometer bias in the tilt.
 
-    ``rotation``: from IMU to level axes. What is known of the bias already stays.
+    ``tilt_variance`` (rad2) is that of the other errors of the level; ``rotation``: from IMU to level axes. What a
+    running search has learnt of the bias stays.
     """
     x, p = state.search.estimate, state.search.covariance
     if state.search.started == 0:
@@ -130,7 +138,7 @@ def note_level(state, tilt_variance, accel_bias_variance, rotation, settings):
 
 @njit
 def predict_search(state, acceleration, rotation, dt, settings):
-    """Advance by ``dt`` s: ``acceleration`` (m/s2) in axes that are level and turned by the unknown angle.
+    """Predict the search over ``dt`` s: ``acceleration`` (m/s2) in level axes turned by the unknown heading.
 
     ``rotation``: from IMU to these axes.
     """
@@ -173,13 +181,13 @@ def predict_search(state, acceleration, rotation, dt, settings):
 
 @njit
 def update_search(state, first, measured, lever, noise, gate, work):
-    """Fuse east and north of a position (``first`` 0, m) or of a velocity (2, m/s) of the antenna.
+    """Update the search with east and north of a position (``first`` 0, m) or velocity (2, m/s) of the antenna.
 
-    ``lever`` is the antenna from the IMU (or its velocity), in the axes of the acceleration; ``noise`` (3, 3) in map
-    axes; beyond ``gate`` in NIS nothing is fused.
+    ``lever`` is the antenna from the IMU (or its velocity) in the axes of the acceleration; ``noise`` (3, 3) is in map
+    axes. A measurement whose NIS is above ``gate`` is not fused.
     """
     x, p = state.search.estimate, state.search.covariance
-    # One row of H has the one, the cosine and the sine: measured = x[first] + lever turned by (cos, sin).
+    # measured = x[first] + lever turned by (cos, sin): the columns of H for cosine and sine.
     h = ((lever[0], -lever[1]), (lever[1], lever[0]))
     innovation_e = measured[0] - x[first] - h[0][0] * x[4] - h[0][1] * x[5]
     innovation_n = measured[1] - x[first + 1] - h[1][0] * x[4] - h[1][1] * x[5]
@@ -207,7 +215,7 @@ def update_search(state, first, measured, lever, noise, gate, work):
 
 @njit
 def turn_found(state):
-    """Return the turn (rad) from the level axes to the map, and its standard deviation; infinite while undecided."""
+    """Return the turn (rad) from the level axes to the map and its standard deviation (rad, infinite if undecided)."""
     if state.search.started == 0:
         return 0.0, math.inf
     c, s = state.search.estimate[COSINE], state.search.estimate[COSINE + 1]
@@ -222,7 +230,7 @@ def turn_found(state):
 
 @njit
 def spread(state, cosine, sine):
-    """Return the standard deviations of (cos, sin) along and across a direction."""
+    """Return the standard deviations of (cos, sin) along and across the direction ``cosine``, ``sine``."""
     p = state.search.covariance
     cc, cs, ss = p[COSINE, COSINE], p[COSINE, COSINE + 1], p[COSINE + 1, COSINE + 1]
     along = cosine**2 * cc + 2.0 * cosine * sine * cs + sine**2 * ss

@@ -1,8 +1,8 @@
-"""Heading at start from a sensor that tells it: a dual antenna, a magnetometer, an IMU with a filter of its own.
+"""Initial heading from a sensor that measures it: dual antenna, magnetometer, or an IMU with its own filter.
 
-One message may be wrong. So the heading counts as known when a few in a row agree on how far the attitude, which the
-gyros carry meanwhile, is turned. The sensors have ranks: while a better one speaks, what the others say is not heard,
-and they have to wait long enough for it to speak.
+One message may be wrong. The heading therefore counts as known when several messages in a row agree on how far the
+attitude, which the gyros carry meanwhile, must be turned. The sensors are ranked: while a better sensor reports, the
+others are ignored, and each has to wait long enough for the better ones to report.
 """
 
 from __future__ import annotations
@@ -34,11 +34,14 @@ CANDIDATE = np.dtype(
     ],
     align=True,
 )
-"""What a sensor says of the unknown heading, and when a heading was given.
+"""The heading that a sensor proposes while it is unknown, and when a heading was given.
 
-``candidate_*``: rank of the sensor, how often it agreed with itself since when, its last message, by how much (rad) it
-would turn the attitude, and the standard deviation. ``given_stamp``: by parameter, from memory, or by a pose.
-``disputed``: the dual antenna contradicts it.
+- ``candidate_rank``: the rank of the sensor.
+- ``candidate_count``, ``candidate_since``, ``candidate_stamp``: messages in a row that agree, the first and the last
+  (ns).
+- ``candidate_turn``, ``candidate_std``: the proposed turn of the attitude (rad), and its standard deviation.
+- ``given_stamp``: when a parameter, the memory or a pose gave the heading (ns).
+- ``disputed``: whether the dual antenna contradicts that heading.
 """
 
 DUAL_ANTENNA = 0
@@ -46,30 +49,35 @@ MAGNETOMETER = 1
 IMU_ORIENTATION = 2
 
 MESSAGES = 3
+"""Messages in a row, at least, that must agree before the heading is set."""
+
 SHORTEST_TIME = (0.3, 3.0, 3.0)
-"""So many messages, over at least so long (s, by rank), must agree."""
+"""s; time over which these messages must agree, at least, by rank of the sensor."""
 
 SILENCE = 5.0
-"""A better sensor that was silent for so long (s) is no longer waited for."""
+"""s; a better sensor that has been silent for longer is ignored, and a candidate that old starts anew."""
 
 SIGMAS = 3.0
+"""Standard deviations within which two headings agree."""
 
 LARGEST_STD = 0.5
-"""What is less certain (rad) does not tell a heading."""
+"""rad; a measurement with a larger standard deviation does not propose a heading."""
 
 REFUTING_TIME = 5.0
+"""s; time over which rejected headings of the dual antenna must agree to refute a given heading."""
+
 TRIAL_TIME = 20.0
-"""Rejected headings that agree for so long (s) refute a given one, if they began so soon (s) after it was given."""
+"""s; rejected headings refute a given heading only if they began within this time after it was given."""
 
 OPEN_STD = 1.0
-"""The heading is first set with this standard deviation (rad); the update by the message makes it what it is."""
+"""rad; standard deviation with which the heading is first set; the update by the same message then narrows it."""
 
 
 @njit
 def update_unknown_heading(state, aid, settings, work):
-    """Consider a measurement of the unknown heading, described by ``work``; set the heading if it is beyond doubt.
+    """Propose a heading from the measurement in ``work``; set the heading if enough messages agree.
 
-    When it returns True the measurement is still to be fused.
+    Returns whether the heading was set; then the measurement is still to be fused.
     """
     if aid.payload[3] < 0.0:
         return False
@@ -96,7 +104,7 @@ def update_unknown_heading(state, aid, settings, work):
 
 @njit
 def update_heading_candidate(state, stamp, rank, turn, std, shortest_time):
-    """Say whether enough messages in a row, this one the last, would turn the attitude alike (rad)."""
+    """Say whether enough messages in a row, this one the last, propose the same turn (rad) of the attitude."""
     age = (stamp - state.heading.candidate_stamp) * 1e-9
     if state.heading.candidate_count > 0 and rank > state.heading.candidate_rank and age < SILENCE:
         return False
@@ -119,11 +127,11 @@ def update_heading_candidate(state, stamp, rank, turn, std, shortest_time):
 
 @njit
 def update_refutation(state, aid, settings, work):
-    """Consider a heading of the dual antenna that was rejected; say whether it refutes a heading that was given.
+    """Say whether a rejected heading of the dual antenna, with those before it, refutes a heading that was given.
 
-    A parameter, a memory or a pose may be wrong, and a filter that trusts them rejects for ever the sensor that knows
-    better. So what was given holds only if the antennas are heard to agree with it, and not if those that were rejected
-    from the beginning agree with each other.
+    A parameter, the memory or a pose may be wrong, and a filter that trusts them would reject the better sensor for
+    ever. A given heading therefore holds only once the dual antenna has agreed with it. Antennas that were rejected
+    from the beginning and agree with each other refute it.
     """
     is_doubtful = (
         state.heading.given_stamp != NEVER
@@ -139,10 +147,10 @@ def update_refutation(state, aid, settings, work):
 
 @njit
 def reset_given_heading(state, aid, settings, work):
-    """Take the heading of the antennas, if they were believed before, else none: antennas may be swapped, too.
+    """Drop a refuted heading: take that of the antennas if they were fused before; return whether they have won.
 
-    Then only motion decides, and the caller has to restart the alignment. The velocity, led astray meanwhile, is open.
-    Returns whether the antennas have won.
+    Otherwise the antennas may be wrong, too (swapped), and only motion can decide: the caller has to restart the
+    alignment. The velocity went wrong with the heading, so its variance is opened.
     """
     state.heading.given_stamp = NEVER
     state.heading.candidate_count = 0

@@ -1,4 +1,4 @@
-"""Level from gravity, and the gyro bias of a robot at rest."""
+"""Levelling: roll and pitch from gravity, and the gyro bias of a robot at rest."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ LEVELLING = np.dtype(
     ],
     align=True,
 )
-"""What was known of the gyro bias (rad/s) before the run of still windows, and its variance."""
+"""The gyro bias (rad/s) that was known before the run of still windows, and its variance."""
 
 DRIFTED = 2.0
-"""Levelling on the way is worth it when it makes the variance of the tilt smaller by this factor."""
+"""Ratio of the present tilt variance to that of a new level above which a robot in motion is levelled again."""
 
 UNKNOWN_SPEED = 10.0
-"""Levelling in a turn: the speed (m/s) that makes the centripetal acceleration taken for tilt."""
+"""m/s; speed assumed where it is unknown: in a turn, levelling takes its centripetal acceleration for tilt."""
 
 
 @njit
 def level(state, sums, count, interval, is_rest, settings):
-    """Set roll, pitch and, at rest, the gyro bias from mean readings; heading stays as it was.
+    """Set roll and pitch from mean readings and, at rest, the gyro bias; the heading stays as it was.
 
-    ``sums`` of force (m/s2) and rate (rad/s) over ``count`` samples ``interval`` s apart.
+    ``sums`` of force (m/s2) and rate (rad/s) over ``count`` samples, ``interval`` s apart.
     """
     duration = count * interval
     force = (sums[0] / count, sums[1] / count, sums[2] / count)
@@ -48,7 +48,7 @@ def level(state, sums, count, interval, is_rest, settings):
         keep_gyro_bias(state)
     accel_bias, accel_variance, gyro_bias, gyro_variance = known_biases(state, force, rate, duration, is_rest, settings)
     if is_rest and not can_be_rest(state, rate, gyro_bias, gyro_variance, duration, settings):
-        # What is not known to be rest has to wait as if it were motion.
+        # Readings that may not be at rest are treated as motion: they have to wait.
         state.window.still_stamp = NEVER
         state.window.still_samples = 0
         if state.level_known == 1 or (state.stamp - state.first_stamp) * 1e-9 < settings.moving_start_after:
@@ -71,7 +71,7 @@ def level(state, sums, count, interval, is_rest, settings):
     reset_attitude(state, shortest_turn(measured, up))
     reset_tilt(state, up, strength, accel_bias, accel_variance, tilt_noise, settings)
     update_gyro_bias_at_rest(state, gyro_bias, gyro_variance, rate, up, duration, is_rest, settings)
-    # The parameter is true of the start only, not of where a restart finds the robot.
+    # The parameter holds at the first start only: after a restart the robot may have turned.
     if state.level_known == 0 and state.restarts == 0 and not math.isnan(settings.initial_heading):
         state.heading_known = 1
         reset_heading(state, settings.initial_heading, settings.initial_heading_std, settings)
@@ -84,7 +84,8 @@ def level(state, sums, count, interval, is_rest, settings):
 def known_biases(state, force, rate, duration, is_rest, settings):
     """Return accelerometer bias (m/s2), its variance, gyro bias (rad/s), its variance as known before this level.
 
-    From the last run, if the readings allow it, from the windows before this run of them, else from the parameters.
+    They come from the last run if the readings allow it, from the windows before this run of still windows, else from
+    the parameters.
     """
     accel_bias, accel_variance = (0.0, 0.0, 0.0), settings.accel_bias_std**2
     gyro_bias, gyro_variance = (0.0, 0.0, 0.0), settings.gyro_bias_std**2
@@ -100,7 +101,7 @@ def known_biases(state, force, rate, duration, is_rest, settings):
 
 @njit
 def can_be_rest(state, rate, gyro_bias, gyro_variance, duration, settings):
-    """Say whether still readings are those of rest: no even braking, no slow turn, no bias that nobody expected."""
+    """Say whether quiet readings can be those of rest: no even braking, no slow turn, no unexpected bias."""
     if state.residual.moved_first == 1 or is_moving(state):
         return False
     return can_be_bias(rate, gyro_bias, math.sqrt(gyro_variance), mean_rate_std(duration, settings))
@@ -108,7 +109,7 @@ def can_be_rest(state, rate, gyro_bias, gyro_variance, duration, settings):
 
 @njit
 def sway_left(sway, duration, settings):
-    """Return the variance that swaying leaves in the mean over ``duration`` (s); ``sway`` is that of one window."""
+    """Return the variance that residual motion leaves in a mean over ``duration`` (s); ``sway``: in one window."""
     return sway * min(1.0, settings.static_duration / duration)
 
 
@@ -116,7 +117,8 @@ def sway_left(sway, duration, settings):
 def tilt_noise_at_rest(state, duration, strength, settings):
     """Return the variance (rad2) of the direction of the mean force, without that of the accelerometer bias.
 
-    A bias that walks differs at the end from its mean by a third of the variance that it walks meanwhile.
+    The bias is a random walk: its value at the end differs from its mean by a third of the variance that it gains
+    meanwhile.
     """
     walked = settings.accel_bias_random_walk**2 * duration / 3.0
     swayed = sway_left(state.residual.force_variance, duration, settings)
@@ -125,16 +127,16 @@ def tilt_noise_at_rest(state, duration, strength, settings):
 
 @njit
 def is_level_better_known(state, variance):
-    """Say whether a robot that sways has a level already that is better than the one it would get (rad2)."""
+    """Say whether a swaying robot already has a level with a smaller variance (rad2) than the new one."""
     known = max(state.covariance[ATTITUDE, ATTITUDE], state.covariance[ATTITUDE + 1, ATTITUDE + 1])
     return state.residual.force_variance > 0.0 and state.level_known == 1 and known < variance
 
 
 @njit
 def reset_tilt(state, up, strength, accel_bias, accel_variance, tilt_noise, settings):
-    """Write the accelerometer bias, and the covariance of a fresh level.
+    """Set the accelerometer bias, and the covariance of tilt, heading and accelerometer bias after a levelling.
 
-    The accelerometer bias tilts the level, theta = up x (R dba) / g: the cross covariance says so (Groves, section
+    The accelerometer bias tilts the level: theta = up x (R dba) / g. Hence their cross covariance (Groves, section
     5.6.2).
     """
     rotation = to_matrix(state.attitude)
@@ -164,7 +166,7 @@ def reset_tilt(state, up, strength, accel_bias, accel_variance, tilt_noise, sett
 
 @njit
 def keep_gyro_bias(state):
-    """Keep what is known of the gyro bias when a run of windows begins: the prior of what its windows say together."""
+    """Keep the known gyro bias when a run of still windows begins, as the prior of the whole run."""
     state.levelling.kept_gyro_variance = math.inf
     if state.level_known == 0:
         return
@@ -177,7 +179,7 @@ def keep_gyro_bias(state):
 
 @njit
 def update_level(state, window, settings):
-    """Level at the end of a static window (`Window`), at rest or, when that does not come, while moving."""
+    """Level at the end of a static window (`Window`): at rest or, if rest does not come, in motion."""
     if state.heading_known == 0 or state.position_known == 0:
         interval = (state.stamp - state.window.start) * 1e-9 / state.window.samples
         if window == Window.REST:
@@ -190,9 +192,9 @@ def update_level(state, window, settings):
 
 @njit
 def update_level_in_motion(state, settings):
-    """Level on the way, at the end of a window, when the gyros have drifted further than such a level is wrong.
+    """Level in motion at the end of a window, if the gyros have drifted further than such a level is wrong.
 
-    Of a robot that is never at rest the gyro bias is not known, and without a heading GNSS tells nothing of the tilt.
+    A robot that is never at rest has no known gyro bias, and without a heading GNSS does not observe its tilt.
     """
     if state.level_known == 0 or state.heading_known == 1 or state.window.still_stamp == state.stamp:
         return
@@ -206,17 +208,18 @@ def update_level_in_motion(state, settings):
 
 @njit
 def mean_rate_std(duration, settings):
-    """Return by how much (rad/s) the mean rate over ``duration`` (s) at rest differs from the gyro bias at the end."""
+    """Return the standard deviation (rad/s) of the mean rate at rest over ``duration`` (s) about the present bias."""
     white = settings.gyro_noise_density**2 / duration
     return math.sqrt(white + settings.gyro_bias_random_walk**2 * duration / 3.0)
 
 
 @njit
 def update_gyro_bias_at_rest(state, prior_bias, prior, mean_rate, up, duration, is_rest, settings):
-    """Estimate the gyro bias from the mean rate at rest; what is not known of the Earth rate enters its sigma.
+    """Set the gyro bias to the weighted mean of its prior and of the mean rate at rest minus the Earth rate.
 
-    The prior (``prior_bias``, rad/s, IMU axes, with variance ``prior``) and the mean are weighed along the vertical
-    and across it, because without heading only the vertical part of the Earth rate is known.
+    The prior (``prior_bias``, rad/s, IMU axes, with variance ``prior``) and the mean rate are weighed along the
+    vertical and across it, because without a heading only the vertical part of the Earth rate is known. The unknown
+    part enters the variance.
     """
     rotation = to_matrix(state.attitude)
     noise = mean_rate_std(duration, settings) ** 2
@@ -227,7 +230,7 @@ def update_gyro_bias_at_rest(state, prior_bias, prior, mean_rate, up, duration, 
     horizontal_square = dot(earth, earth) - vertical_rate**2
     known = (vertical_rate * up[0], vertical_rate * up[1], vertical_rate * up[2])
     vertical_variance = noise
-    # Of unknown direction: half of its square falls on each horizontal axis.
+    # Its direction is unknown: half of its square falls on each horizontal axis.
     horizontal_variance = noise + 0.5 * horizontal_square
     if state.frame.datum_known == 0:
         vertical_variance = noise + EARTH_RATE**2
@@ -262,7 +265,7 @@ def update_gyro_bias_at_rest(state, prior_bias, prior, mean_rate, up, duration, 
 
 @njit
 def reset_level_to_moving(state, settings):
-    """Give tilt and gyro bias the uncertainty of a level taken while moving."""
+    """Reset tilt and gyro bias to the uncertainty of a level taken in motion: the last level was not taken at rest."""
     state.window.still_stamp = NEVER
     state.window.still_samples = 0
     note_level(state, settings.moving_tilt_std**2, settings.accel_bias_std**2, to_matrix(state.attitude), settings)

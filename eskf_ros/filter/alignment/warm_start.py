@@ -1,7 +1,7 @@
-"""Warm start: what one run knew of biases, place and heading, offered to the next.
+"""Warm start: biases, place and heading at the end of one run, offered to the next.
 
-Nothing of it is believed unseen. The biases are a prior of the levelling, and are dropped where a robot at rest
-contradicts them; the heading is taken when the first fix finds the robot where it was left (``alignment``).
+All of it is checked before use. The biases are a prior of the levelling and are dropped where a robot at rest
+contradicts them. The heading is used when the first fix finds the robot where it was left (`heading`).
 """
 
 from __future__ import annotations
@@ -14,21 +14,24 @@ from eskf_ros.geodesy.earth import EARTH_RATE, STANDARD_GRAVITY
 from eskf_ros.geodesy.rotation import dot
 
 CONTRADICTION = 5.0
-"""Sigma beyond which a reading at rest contradicts a remembered bias."""
+"""Standard deviations beyond which a reading at rest contradicts a remembered bias."""
 
 
 @dataclass(frozen=True)
 class Memory:
-    """What is worth knowing at the next start. Position and heading are those of base_link; biases in IMU axes."""
+    """The state of one run that the next one can use: position and heading of base_link, biases in IMU axes.
+
+    Units: position and its standard deviation in m, biases in m/s2 and rad/s.
+    """
 
     stamp: int
-    """ns, of the IMU sample it holds for."""
+    """ns; stamp of the IMU sample for which it holds."""
     latitude_deg: float
     longitude_deg: float
     altitude: float
     position_std: float
     heading_deg: float
-    """Of the x axis: 0 = east at this place, counter-clockwise."""
+    """Heading of the x axis of base_link: 0 = east at this place, counter-clockwise."""
     heading_std_deg: float
     accel_bias: tuple[float, ...]
     accel_bias_std: tuple[float, ...]
@@ -38,9 +41,9 @@ class Memory:
 
 @njit
 def do_biases_hold(state, mean_force, mean_rate, duration, still, settings):
-    """Say whether the remembered biases are to be used for levelling: at rest they must not contradict the readings.
+    """Say whether the remembered biases may be used for levelling: at rest they must not contradict the readings.
 
-    Mean readings (m/s2, rad/s, IMU axes) over ``duration`` (s). After a restart the memory is too old.
+    The mean readings (m/s2, rad/s, IMU axes) are over ``duration`` (s). After a restart the memory is too old.
     """
     if settings.has_memory == 0 or state.restarts > 0:
         return False

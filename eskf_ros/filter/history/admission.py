@@ -1,4 +1,4 @@
-"""The door: what a message must be before it enters the timeline. A bad one is named and never applied."""
+"""Admission: what a message must be before it enters the timeline. A bad one gets a verdict and is never applied."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from eskf_ros.compiled import njit
 from eskf_ros.filter.state.enums import Verdict
 
 VARIANCES = (3, 6, 8)
-"""Where the variances of the three values are in the payload."""
+"""Index in the payload of the variances of the three values."""
 
 ABSENT = -1.0
-"""The variance of an axis that was not measured."""
+"""Variance of an axis that was not measured."""
 
 
 @njit
 def admit(offered, values, covariance, stand_in, scale, std_floor, may_lack_axes):
-    """Write three values and the conditioned covariance to the payload of the record on offer; return its door.
+    """Write three values and the conditioned covariance to the payload of the record on offer; return its verdict.
 
-    ``covariance`` row-major 3x3, in the unit of the values squared; when ``stand_in`` has a positive first element it
-    is the diagonal used instead. Scaled, then lifted to the floor (one for each axis): raising the diagonal of a
-    positive semidefinite matrix keeps it one. An axis that may lack and whose variance is negative or no number was
-    not measured: its value becomes 0 and its variance -1.
+    ``covariance`` is row-major 3x3, in the unit of the values squared; if ``stand_in`` has a positive first element, it
+    is the diagonal used instead. The covariance is scaled by ``scale``, then its diagonal is raised to the floor
+    (``std_floor``, per axis), which keeps a positive semidefinite matrix positive semidefinite. If ``may_lack_axes``,
+    an axis whose variance is negative or NaN was not measured: its value becomes 0 and its variance -1.
     """
     payload = offered[0].payload
     for i in range(3):
@@ -65,7 +65,7 @@ def admit(offered, values, covariance, stand_in, scale, std_floor, may_lack_axes
 
 @njit
 def take_out_absent_axes(payload):
-    """Zero what belongs to axes with a negative variance or none; return them as bits."""
+    """Zero the values and covariances of axes whose variance is negative or NaN; return these axes as bits."""
     lacking = 0
     for i in range(3):
         if not payload[VARIANCES[i]] >= 0.0:

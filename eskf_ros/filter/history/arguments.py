@@ -1,4 +1,4 @@
-"""What a caller hands in and gets back: stamps, vectors and covariances checked for type and shape."""
+"""Arguments and results of the navigator: stamps, vectors and covariances checked for type and shape."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ StampArray = npt.NDArray[np.int64]
 
 
 def copied(records: np.ndarray, count: int) -> np.ndarray:
-    """Return the first records in memory of their own: through bytes, because numpy copies them field by field."""
+    """Return the first ``count`` records in memory of their own: through bytes, because numpy copies field by field."""
     return np.frombuffer(bytearray(records[:count].tobytes()), records.dtype)
 
 
@@ -29,7 +29,7 @@ def whole_stamp(stamp: int) -> int:
 
 
 def whole_stamps(stamps: StampArray) -> StampArray:
-    """Return stamps as int64; raises TypeError for those that are not integers."""
+    """Return stamps (n,) as int64; raises TypeError if they are not integers, ValueError for another shape."""
     found = np.asarray(stamps)
     if found.ndim != 1:
         raise ValueError(f"stamps have the shape {found.shape}; one row of n is needed: (n,)")
@@ -42,7 +42,7 @@ def whole_stamps(stamps: StampArray) -> StampArray:
 
 
 def vectors(name: str, values: FloatArray, count: int) -> FloatArray:
-    """Return a vector for each of ``count`` stamps as float64 (n, 3); raises ValueError for another shape."""
+    """Return the vectors of ``count`` stamps as float64 (n, 3); raises ValueError for another shape."""
     found = np.ascontiguousarray(values, np.float64)
     if found.shape != (count, 3):
         raise ValueError(f"{name} has the shape {found.shape}; {count} stamps need ({count}, 3)")

@@ -1,4 +1,4 @@
-"""The buffers of the history: they grow with the window and the rates of the messages, not with time."""
+"""Buffers of the history: their size follows the window and the rates of the messages, not the running time."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from eskf_ros.filter.state.memory import allocate
 from eskf_ros.filter.state.time import NEVER
 
 IMU_BATCH = 1024
-"""IMU samples that are taken at a time."""
+"""IMU samples that are inserted at once, at most."""
 
 FIRST_SIZE = 256
-"""Measurements, and checkpoints, for which there is room at first."""
+"""Initial capacity for measurements, and for checkpoints."""
 
 
 class Buffers:
     """IMU samples, offered measurements, checkpoints of the state and published rows, each in one growing array."""
 
     def __init__(self, state: np.dtype, row: np.dtype) -> None:
-        """``state`` and ``row``: the records of checkpoints and of what is published for an IMU sample."""
+        """Allocate the buffers; ``state``, ``row``: record types of a checkpoint and of an output row."""
         self.imu = allocate(IMU, 4 * IMU_BATCH)
         self.aids = allocate(AID, FIRST_SIZE)
         self.checkpoints = allocate(state, FIRST_SIZE)
@@ -28,7 +28,7 @@ class Buffers:
         self.timeline = allocate(TIMELINE)
 
     def restart(self, window: int) -> None:
-        """Forget everything; ``window`` (ns) is how far back late messages are taken in."""
+        """Forget everything; late messages are accepted within ``window`` (ns)."""
         self.timeline = allocate(TIMELINE)
         for field in ("frontier", "published", "barrier"):
             self.timeline[field] = NEVER
@@ -37,13 +37,13 @@ class Buffers:
 
     @property
     def held_bytes(self) -> int:
-        """Memory of the buffers."""
+        """Memory of the buffers (bytes)."""
         return sum(buffer.nbytes for buffer in (self.imu, self.aids, self.checkpoints, self.rows))
 
     def _wanted(self, aids: int, constraints: int) -> tuple[int, int, int]:
-        """IMU samples, measurements and checkpoints after one batch and ``aids`` measurements.
+        """Return the IMU samples, measurements and checkpoints after one more batch and ``aids`` more measurements.
 
-        An interval between two samples has room for one grid point of the constraints.
+        An interval between two samples contains at most one grid point of the constraints.
         """
         timeline = self.timeline[0]
         return (
@@ -53,16 +53,16 @@ class Buffers:
         )
 
     def have_room(self, aids: int, constraints: int) -> bool:
-        """Whether a batch of IMU samples and ``aids`` measurements fit in, with ``constraints`` at each grid point."""
+        """Say whether one batch of IMU samples and ``aids`` measurements fit in; ``constraints``: per grid point."""
         wanted = self._wanted(aids, constraints)
         return all(len(held) >= size for held, size in zip((self.imu, self.aids, self.checkpoints), wanted))
 
     def forget(self, states: np.ndarray) -> None:
-        """Drop what no message in time can reach any more."""
+        """Drop what no accepted message can change any more; ``states``: the present state."""
         forget(states, self.imu, self.aids, self.checkpoints, self.timeline)
 
     def grow(self, aids: int, constraints: int) -> None:
-        """Make the buffers twice as large as what has to fit in (see `have_room`)."""
+        """Grow the buffers to twice the needed size or more (see `have_room`)."""
         imu, offered, checkpoints = self._wanted(aids, constraints)
         while len(self.imu) < 2 * imu:
             self.imu = doubled(self.imu)

@@ -1,4 +1,4 @@
-"""Records of the history: IMU samples, offered measurements, their verdicts, and how full the buffers are."""
+"""Records of the history: IMU samples, offered measurements, their verdicts, fill levels of the buffers."""
 
 from __future__ import annotations
 
@@ -24,10 +24,11 @@ AID = np.dtype(
     ],
     align=True,
 )
-"""One offered measurement: what was sent, what became of it, and whether ``take_live`` has told that already.
+"""One offered measurement: what was sent, what became of it, and whether `take_live` has reported it (``told``).
 
-``source``: which of several receivers it is from. ``payload``: three values, the upper triangle of their covariance by
-rows, and what else the file of the aid says.
+``stream``, ``source``: what it measures, and which of several receivers sent it. ``door``: the verdict of the
+admission; ``verdict``: that of the fusion. ``dof``: number of scalars. ``payload``: three values, the upper triangle of
+their covariance by rows, and further fields that the file of the measurement describes.
 """
 
 RECORD = np.dtype(
@@ -42,7 +43,7 @@ RECORD = np.dtype(
         ("innovation", "f8", (3,)),
     ]
 )
-"""The final record of one offered measurement."""
+"""The final record of one offered measurement; fields as in AID."""
 
 TIMELINE = np.dtype(
     [
@@ -67,10 +68,16 @@ TIMELINE = np.dtype(
     ],
     align=True,
 )
-"""Fill levels of the history buffers, the newest IMU stamp, how far back the next advance has to start; counters.
+"""Fill levels of the history buffers, stamps (ns) that divide the timeline, and counters.
 
-``recorded``: aids at the head of the buffer whose final record was handed out. ``published``: newest stamp for which
-a row was written. ``barrier``: nothing older is accepted. ``furthest_late``: largest lateness (ns) refused.
-``elsewhere_count``: refused samples in a row that follow each other far from the frontier; ``elsewhere_stamp``: the
-last one's stamp.
+- ``imu_count``, ``aid_count``, ``checkpoint_count``: fill levels; ``since_checkpoint``: IMU samples since the last
+  checkpoint.
+- ``recorded``: measurements at the head of the buffer whose final record was handed out.
+- ``frontier``: the newest IMU stamp; ``published``: the newest stamp for which a row was written.
+- ``rewind_to``: the stamp from which the next advance has to start.
+- ``window``, ``barrier``: messages older than the frontier minus the window, or than the barrier, are refused.
+- ``furthest_late``: the largest lateness (ns) refused.
+- ``imu_*``: IMU samples offered, and refused or replaced by reason.
+- ``elsewhere_count``, ``elsewhere_stamp``: refused samples in a row that follow each other far from the frontier, and
+  the stamp of the last.
 """

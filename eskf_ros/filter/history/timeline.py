@@ -1,12 +1,12 @@
-"""The timeline: what the estimator was told in the last seconds, in one total order, and checkpoints to go back to.
+"""The timeline: messages of the last seconds in one total order, and checkpoints for out-of-sequence messages.
 
-The order is (stamp, stream rank, source, door, payload). IMU samples and aids wait in two sorted buffers. A checkpoint
-is a copy of the whole state right after an IMU sample and before the aids of the same stamp. What arrives behind the
-state only marks how far to go back: the next advance restores the newest checkpoint before it and applies again all
-that follows, so the result is a function of the sorted contents alone.
+The order is (stamp, stream rank, source, admission, payload). IMU samples and measurements wait in two sorted buffers.
+A checkpoint is a copy of the whole state right after an IMU sample and before the measurements of the same stamp. A
+message that arrives behind the state only marks how far to go back: the next advance restores the newest checkpoint
+before it and applies again all that follows. The result is therefore a function of the sorted contents alone.
 
-Constraints (rest, no side slip), which no sensor sends, lie among the aids on a grid of stamps, wherever IMU samples
-are close together.
+Constraints (rest, no side slip), which no sensor sends, are sorted among the measurements on a grid of stamps, wherever
+IMU samples are close together.
 
 A message is in time if its stamp is not older than the newest IMU stamp (the frontier) minus the window.
 """
@@ -23,41 +23,44 @@ from eskf_ros.filter.state.memory import allocate
 from eskf_ros.filter.state.time import NEVER
 
 EARLY_AIDS = 4096
-"""So many aids may wait for the first IMU sample."""
+"""Measurements that may wait for the first IMU sample, at most."""
 
 CHECKPOINT_SPACING = 16
-"""IMU samples from one checkpoint to the next: what a rewind does again in vain, at the most.
-
-A copy of the state costs as much as half a sample.
+"""IMU samples between two checkpoints: a rewind repeats at most this many in vain. A copy of the state costs as much as
+half a sample.
 """
 
 LARGEST_FORCE = 1000.0
+"""m/s2; no strapdown IMU on a robot reads more."""
+
 LARGEST_RATE = 100.0
-"""What no strapdown IMU on a robot reads (m/s2, rad/s)."""
+"""rad/s; no strapdown IMU on a robot reads more."""
 
 LARGEST_JUMP = 10_000_000_000
-"""A stamp this far (ns) from the frontier is not believed ..."""
+"""ns; an IMU stamp further from the frontier is not believed until `JUMP_CONFIRMATIONS` samples confirm it."""
 
 JUMP_CONFIRMATIONS = 10
+"""IMU samples in a row that must follow each other at the new time to confirm a jump of the stamps."""
+
 LONGEST_STEP = 1_000_000_000
-"""... until so many IMU samples in a row go on from there, each at most this much (ns) after the one before."""
+"""ns; longest interval between two samples that confirm a jump."""
 
 
 @njit
 def go_back_to(timeline, stamp):
-    """Make the next advance start from a checkpoint not later than ``stamp``."""
+    """Let the next advance start from a checkpoint not later than ``stamp`` (ns)."""
     timeline.rewind_to = min(timeline.rewind_to, stamp)
 
 
 @njit
 def oldest_in_time(timeline):
-    """Return the oldest stamp that is still in time: within the window, and after the last barrier."""
+    """Return the oldest stamp (ns) that is still accepted: within the window, and after the last barrier."""
     return max(timeline.frontier - timeline.window, timeline.barrier)
 
 
 @njit
 def rewind(states, checkpoints, timeline, blank):
-    """Restore the newest checkpoint not later than what was asked for, and drop the later ones."""
+    """Restore the newest checkpoint not later than ``timeline.rewind_to``, or ``blank``, and drop the later ones."""
     if timeline.rewind_to > states[0].stamp:
         timeline.rewind_to = -NEVER
         return
@@ -75,7 +78,7 @@ def rewind(states, checkpoints, timeline, blank):
 
 @njit
 def save_checkpoint(states, checkpoints, timeline):
-    """Keep a copy of the state after every few IMU samples."""
+    """Save a checkpoint after every `CHECKPOINT_SPACING` IMU samples."""
     if timeline.checkpoint_count > 0:
         timeline.since_checkpoint += 1
         if timeline.since_checkpoint < CHECKPOINT_SPACING:
@@ -98,8 +101,9 @@ def is_bad_value(force, rate):
 def is_far(timeline, stamp, started):
     """Say whether an IMU stamp is so far from the frontier that one of the two must be wrong.
 
-    Behind it only until the attitude is level (``started``) or a barrier stands: so far nothing was given out, and the
-    frontier may be a first stamp that was never true. Later what is behind is late. No message in time is ever far.
+    A stamp far behind counts only until the attitude is level (``started``) or a barrier stands: until then nothing was
+    published, and the frontier may come from one wrong stamp. Later such a sample is late. No message in time is ever
+    far.
     """
     if timeline.frontier == NEVER:
         return False
@@ -111,7 +115,7 @@ def is_far(timeline, stamp, started):
 
 @njit
 def confirm_jump(timeline, stamp):
-    """Count a sample far from the frontier; say whether enough of them in a row follow each other."""
+    """Count a sample far from the frontier; say whether `JUMP_CONFIRMATIONS` of them in a row follow each other."""
     follows = 0 < stamp - timeline.elsewhere_stamp <= LONGEST_STEP
     timeline.elsewhere_count = timeline.elsewhere_count + 1 if follows else 1
     timeline.elsewhere_stamp = stamp
@@ -120,7 +124,7 @@ def confirm_jump(timeline, stamp):
 
 @njit
 def begin_again(aids, timeline):
-    """Take back all IMU samples: the next advance starts from the blank state, with the aids that sensors sent."""
+    """Drop all IMU samples: the next advance starts from the blank state, with the measurements that sensors sent."""
     kept = timeline.recorded
     for i in range(timeline.recorded, timeline.aid_count):
         if aids[i].stream < SENSOR_STREAMS:
@@ -136,10 +140,10 @@ def begin_again(aids, timeline):
 
 @njit
 def insert_imu(imu, aids, timeline, locals_, settings_, stamps, specific_force, angular_rate, first):
-    """Sort samples ``first`` and following into the buffer; return how many were taken before it was full.
+    """Sort the samples from ``first`` on into the buffer; return the index of the first one that no longer fits.
 
-    Each is checked at the door: finite, possible, stamp neither too old nor absurdly far from the others. Of two with
-    one stamp the one with the smaller bits stays. The constraints on the grid come with the samples around them.
+    Each is checked: finite, possible, stamp neither too old nor absurdly far from the others. Of two samples with one
+    stamp the smaller one stays. The constraints on the grid are added with the samples around them.
     """
     t = timeline[0]
     gap = min(round(settings_[0].imu_gap * 1e9), CONSTRAINT_INTERVAL)
@@ -196,9 +200,9 @@ def insert_imu(imu, aids, timeline, locals_, settings_, stamps, specific_force, 
 
 @njit
 def add_constraints(aids, t, settings, after, until, gap):
-    """Put the constraints that are switched on to the grid points in (``after``, ``until``], two IMU stamps.
+    """Add the enabled constraints at the grid points in (``after``, ``until``], the stamps of two IMU samples.
 
-    None where one of them is `NEVER`, and none in a gap (ns): nobody knows what the robot did there.
+    None is added if a stamp is `NEVER`, or if they are more than ``gap`` (ns) apart: the motion in a gap is unknown.
     """
     if after == NEVER or until == NEVER or until - after > gap:
         return
@@ -248,7 +252,7 @@ def is_smaller_sample(force, rate, other):
 
 @njit
 def comes_before(a, b):
-    """Say whether aid ``a`` comes before aid ``b``: stamp, stream, source, whether the door let it in, payload."""
+    """Say whether measurement ``a`` comes before ``b`` in the order of stamp, stream, source, admission, payload."""
     if a.stamp != b.stamp:
         return a.stamp < b.stamp
     if a.stream != b.stream:
@@ -265,11 +269,11 @@ def comes_before(a, b):
 
 @njit
 def offer_aid(aids, timeline, offered, stamp, arrival, stream, source, door):
-    """Head the record whose payload is on offer, and sort it into the buffer as `insert_aid` does."""
+    """Complete the record whose payload is on offer, and sort it into the buffer; return what `insert_aid` does."""
     aid = offered[0]
     aid.stamp, aid.arrival, aid.stream, aid.source = stamp, arrival, stream, source
     aid.door, aid.verdict, aid.told = door, door, 0
-    # So it stays in the record of a measurement that waits in vain.
+    # A measurement that waits in vain keeps these values in its record.
     aid.dof, aid.nis = 0, math.nan
     for k in range(3):
         aid.innovation[k] = math.nan
@@ -278,9 +282,9 @@ def offer_aid(aids, timeline, offered, stamp, arrival, stream, source, door):
 
 @njit
 def insert_aid(aids, timeline, offered):
-    """Sort one offered measurement into the buffer, which has room; return the verdict when the door stays shut.
+    """Sort the measurement on offer into the buffer, which has room; return WAITING, or why it is refused.
 
-    Too old for the window, or absurdly far ahead of the newest IMU sample: then it never enters.
+    It is refused if it is too old for the window, or absurdly far ahead of the newest IMU sample.
     """
     t = timeline[0]
     aid = offered[0]
@@ -314,7 +318,7 @@ def is_duplicate(aids, i):
 
 @njit
 def open_record(aids, i):
-    """Begin anew with the record of a measurement; say whether it may be offered to the state."""
+    """Reset the record of a measurement; say whether it may be offered to the state."""
     aid = aids[i]
     aid.verdict = aid.door
     aid.nis = math.nan
@@ -331,7 +335,7 @@ def open_record(aids, i):
 
 @njit
 def forget(states, imu, aids, checkpoints, timeline):
-    """Drop what no message in time can reach: all before the newest checkpoint older than the window."""
+    """Drop what no accepted message can change: all before the newest checkpoint that is older than the window."""
     t = timeline[0]
     keep = 0
     while keep + 1 < t.checkpoint_count and checkpoints[keep + 1].stamp < t.frontier - t.window:
@@ -360,9 +364,9 @@ def forget(states, imu, aids, checkpoints, timeline):
 
 @njit
 def raise_barrier(states, blank, timeline):
-    """Make the present the beginning: nothing older is accepted, and nothing rewinds past it. Buffers are emptied.
+    """Make the present a barrier: nothing older is accepted, nothing rewinds past it, and the buffers are emptied.
 
-    Before the first IMU sample there is no present: what waits stays.
+    Before the first IMU sample there is no present: waiting measurements stay.
     """
     t = timeline[0]
     if t.frontier == NEVER:
@@ -380,7 +384,7 @@ def raise_barrier(states, blank, timeline):
 
 @njit
 def take_final(aids, timeline, out, everything):
-    """Copy the records that can no longer change to ``out`` (long enough); return how many."""
+    """Copy the records that can no longer change to ``out`` (long enough); return their number."""
     t = timeline[0]
     count = 0
     while t.recorded < t.aid_count:

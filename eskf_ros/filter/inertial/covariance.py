@@ -8,10 +8,11 @@ Error dynamics of the local Earth-fixed frame with the attitude error theta on t
     d/dt theta = -R dbg - Omega x theta
     d/dt dba, d/dt dbg = random walks
 
-One interval is integrated to second order: the attitude error of mid-interval enters the velocity, the mean of old
-and new velocity error the position. That is a transition of nine rows which never becomes a matrix: it is applied to
-the columns of P, and again to the columns of the transpose of the result. The bias rows do not change, so the second
-round has nine columns only. Optional errors, of which the core knows nothing, are carried by their columns alone.
+One interval is integrated to second order: the attitude error of mid-interval enters the velocity, the mean of old and
+new velocity error the position. This transition matrix has nine rows other than those of the identity. It is never
+formed: it is applied to the columns of P, and again to the columns of the transpose of the result. The bias rows do not
+change, so the second round has nine columns only. The core does not depend on the augmented states: the transition acts
+on their columns alone.
 """
 
 from __future__ import annotations
@@ -26,11 +27,12 @@ from eskf_ros.geodesy.rotation import rotate
 
 @njit
 def apply_transition(columns, out, count, rotation, force, up, gravity_gradient, earth_rate, dt, coupling):
-    """Write the nine moving rows of one interval's transition times the first ``count`` columns to ``out``.
+    """Write the nine changing rows of one interval's transition matrix times the first ``count`` columns to ``out``.
 
-    ``columns`` has error size rows. ``rotation`` body to map at mid-interval, ``force`` specific force (m/s2, map),
-    ``up`` unit vector (map), ``gravity_gradient`` gravity over Earth radius (1/s2), ``earth_rate`` (rad/s, map), ``dt``
-    in s. ``coupling`` 0 cuts velocity off from attitude and accelerometer bias (unknown heading), 1 is the full model.
+    ``columns`` has error size rows. ``rotation``: body to map at mid-interval; ``force``: specific force (m/s2, map);
+    ``up``: unit vector (map); ``gravity_gradient``: gravity over Earth radius (1/s2); ``earth_rate`` (rad/s, map);
+    ``dt`` in s. ``coupling`` 0 cuts the velocity off from attitude and accelerometer bias (unknown heading), 1 is the
+    full model.
     """
     r00, r01, r02 = rotation[0][0] * dt, rotation[0][1] * dt, rotation[0][2] * dt
     r10, r11, r12 = rotation[1][0] * dt, rotation[1][1] * dt, rotation[1][2] * dt
@@ -102,7 +104,7 @@ def propagate_noise(covariance, velocity_noise, attitude_noise, dt, settings):
 
 @njit
 def propagate_covariance(covariance, size, rotation, force, gravity, earth_rate, dt, coupling, work):
-    """Apply one interval's transition on both sides of the covariance; arguments as for ``apply_transition``.
+    """Apply one interval's transition matrix on both sides of the covariance; arguments as for `apply_transition`.
 
     ``size`` errors are in use; ``gravity`` is the vector (m/s2, map); the result is exactly symmetric.
     """
@@ -132,7 +134,7 @@ def propagate_covariance(covariance, size, rotation, force, gravity, earth_rate,
 
 @njit
 def update_error_axes(covariance, block, matrix):
-    """Replace the three errors from index ``block`` by ``matrix`` (3x3 row tuples) times themselves."""
+    """Transform the three errors from index ``block``, and their covariance, by ``matrix`` (3x3 row tuples)."""
     for j in range(len(covariance)):
         error = rotate(matrix, (covariance[block, j], covariance[block + 1, j], covariance[block + 2, j]))
         for i in range(3):

@@ -1,4 +1,4 @@
-"""The local frame, and what is up in it: the datum, turns of the attitude with its error."""
+"""Navigation frame: the map frame and its datum, the local vertical, turns of the attitude with its error."""
 
 from __future__ import annotations
 
@@ -34,14 +34,16 @@ FRAME = np.dtype(
     ],
     align=True,
 )
-"""The map frame, valid once ``datum_known``: datum (rad, rad, m), its place (m) and axes in ECEF, the Earth rate
-(rad/s, map).
+"""The map frame, valid once ``datum_known``.
+
+``datum``: latitude, longitude (rad), altitude (m). ``origin_ecef``, ``map_to_ecef``: its origin (m) and axes in ECEF.
+``earth_rate_map``: the Earth rate (rad/s, map).
 """
 
 
 @njit
 def set_datum(state, latitude, longitude, altitude):
-    """Latch the local frame: East-North-Up at a geodetic position (rad, rad, m)."""
+    """Set the map frame: East-North-Up at a geodetic position (rad, rad, m)."""
     state.frame.datum[0] = latitude
     state.frame.datum[1] = longitude
     state.frame.datum[2] = altitude
@@ -58,7 +60,7 @@ def set_datum(state, latitude, longitude, altitude):
 
 @njit
 def local_up(state):
-    """Return the unit vector against gravity (map axes) at the current position."""
+    """Return the unit vector against gravity (map axes) at the present position."""
     gravity = gravity_map(state, (state.position_map[0], state.position_map[1], state.position_map[2]))
     scale = -1.0 / math.sqrt(dot(gravity, gravity))
     return (gravity[0] * scale, gravity[1] * scale, gravity[2] * scale)
@@ -66,7 +68,7 @@ def local_up(state):
 
 @njit
 def reset_attitude(state, rotation_vector):
-    """Turn the attitude by a rotation vector in map axes, and its error with it (the error is in map axes too)."""
+    """Turn the attitude by a rotation vector (rad, map axes), and its error with it, which is in map axes, too."""
     turn = from_rotation_vector(rotation_vector)
     attitude = (state.attitude[0], state.attitude[1], state.attitude[2], state.attitude[3])
     attitude = normalized(multiply(turn, attitude))
@@ -77,7 +79,7 @@ def reset_attitude(state, rotation_vector):
 
 @njit
 def reset_datum(state, latitude, longitude, altitude, settings):
-    """Describe the same state in the local frame of another datum (rad, rad, m): an exact rotation and shift."""
+    """Express the same state in the map frame of another datum (rad, rad, m): an exact rotation and translation."""
     old = east_north_up_to_ecef(state.frame.datum[0], state.frame.datum[1])
     offset = rotate(old, state.position_map)
     ecef = (
@@ -129,7 +131,7 @@ def shortest_turn(a, b):
 
 @njit
 def local_east_north_up_to_ecef(state):
-    """Return the rotation from East-North-Up at the current position to ECEF."""
+    """Return the rotation from East-North-Up at the present position to ECEF, as row tuples."""
     offset = rotate(state.frame.map_to_ecef, state.position_map)
     geodetic = ecef_to_geodetic(
         state.frame.origin_ecef[0] + offset[0],
@@ -141,7 +143,10 @@ def local_east_north_up_to_ecef(state):
 
 @njit
 def body_rate(state, rotation):
-    """Return the body rate relative to the Earth (rad/s, body axes)."""
+    """Return the body rate relative to the Earth (rad/s, IMU axes), free of the estimated gyro bias.
+
+    ``rotation``: body to map.
+    """
     earth = rotate_back(rotation, state.frame.earth_rate_map)
     return (
         state.angular_rate[0] - state.gyro_bias[0] - earth[0],

@@ -1,10 +1,11 @@
-"""The track of a receiver: what its fixes say by themselves, and whether they can be believed.
+"""Fix tracker: what the fixes of a receiver say by themselves, and whether they can be believed.
 
-A small filter for each receiver, of where its fixes are and how they move beside the reckoned position: that of the
-navigator without any of its corrections, led by the velocities of the same receiver where there are any. Per axis it
-has two states, offset (m) and rate (m/s), white acceleration noise (Bar-Shalom, Li and Kirubarajan, Estimation with
-Applications to Tracking and Navigation, section 6.2.2), and a gate of its own; what lasts in the errors of fixes is in
-the offset. Fixes that do not follow the others are misses, and after a few of them in a row the track starts anew.
+A small Kalman filter for each receiver tracks the offset of its fixes from the reckoned position: the position of the
+navigator by dead reckoning, without any of its corrections, led by the velocities of the same receiver where it sends
+them. Each axis of map has two states, offset (m) and rate (m/s), driven by white acceleration noise (Bar-Shalom, Li and
+Kirubarajan, Estimation with Applications to Tracking and Navigation, section 6.2.2). The correlated error of fixes is
+part of the offset. The track has a gate of its own: a fix outside is a miss, and after `MISSES` misses in a row the
+track restarts from the newest fix.
 """
 
 from __future__ import annotations
@@ -41,69 +42,90 @@ FIX_TRACKER = np.dtype(
     ],
     align=True,
 )
-"""The track of the fixes by receiver: where they are (m) and move (m/s) beside the reckoned position.
+"""The tracks of the receivers, by source; variances are per axis of map.
 
-The reckoned position is the position without any correction (``corrections_map``). Variances per axis; misses and
-rejected fixes, jumps (m). ``scatter``: of the fixes against what they claim. ``velocity_lead``: how far the velocities
-of the receiver lead away from the reckoned position (m), and how well that is known.
+- ``corrections_map``: sum of all corrections of the position (m): the state minus dead reckoning.
+- ``stamp``: the newest fix of the track (ns).
+- ``offset``, ``rate``: where the fixes are (m) and how they move (m/s) relative to the reckoned position.
+- ``offset_variance``, ``mixed_variance``, ``rate_variance``: their covariance.
+- ``misses``, ``hit_stamp``: fixes in a row outside the gate of the track, and the last fix inside (ns).
+- ``jumps``, ``jump``: how often the fixes stepped aside, and the largest step (m).
+- ``rejected``, ``rejected_since``: fixes of the track in a row that the filter rejected, and the first of them (ns).
+- ``scatter``: mean square of the fixes about the track over the variance that they claim.
+- ``scatter_paid``: the noise factor for which the position was widened last.
+- ``velocity_lead``, ``velocity_lead_variance``: displacement by the receiver's velocities minus that of the reckoned
+  position (m).
 """
 
 SHORTEST_PATIENCE = 1_000_000_000
+"""ns; no stream is called silent earlier than this after its last message."""
+
 LONGEST_PATIENCE = 30_000_000_000
+"""ns; every stream is called silent later than this after its last message."""
+
 MISSED_INTERVALS = 2.5
-"""An aid is silent when so many of its usual intervals pass, within these limits (ns)."""
+"""A stream is silent after this many of its usual intervals without a message, within the two limits above."""
 
 LONGEST_LEAD = 2_000_000_000
-"""A velocity says nothing of what was or will be so long (ns) before or after it."""
+"""ns; a velocity of the receiver leads the track only if it is at most this far away in time."""
 
 MISSES = 3
+"""Fixes in a row outside the gate of the track after which the track restarts."""
+
 MISS_GATE = 16.27
-"""A fix further (squared, in its standard deviations; 3 axes, 0.999) from the track is a miss; the track starts anew
-after so many in a row."""
+"""Gate of the track (NIS of a fix): the chi-square quantile of probability 0.999 with 3 degrees of freedom."""
 
 UNBROKEN = 5_000_000_000
-"""Without a fix that belongs to the track for longer (ns) the reckoned position may have drifted away."""
+"""ns; after a longer time without a fix inside the gate a step is not counted: dead reckoning may have drifted."""
 
 LEAST_JUMP = 2.0
-"""A step (m) that deserves the name."""
+"""m; shorter steps of the fixes are not counted as jumps."""
 
 UNKNOWN_RATE_STD = 10.0
+"""m/s; standard deviation of the rate when a track starts."""
+
 RATE_NOISE_DENSITY = 0.05
+"""m/s2/rtHz; process noise of the rate while velocities lead the track: it forgets within some seconds."""
+
 INERTIAL_NOISE_DENSITY = 0.2
-"""Rate of a new track (m/s), and how fast it may change (m/s2/rtHz), led by velocities or by the IMU alone: the track
-forgets within some seconds."""
+"""m/s2/rtHz; process noise of the rate while the IMU alone reckons: the track forgets faster."""
 
 SCATTER_GAIN = 0.08
+"""Weight of the newest fix in the running mean of the scatter."""
+
 SCATTER_CLIP = 4.0
+"""One fix counts with at most this many times the present scatter."""
+
 SCATTER_SHARE = 10.0
-"""Share of the newest fix in the measure of scatter, and the most that it may add, in measures; variance of the track,
-in that of a fix, from which on it says nothing."""
+"""Ratio of the variance of the track to that of a fix above which the track is too uncertain to learn the scatter."""
 
 SCATTER_GROWTH = 4.0
-"""A step aside and back does not make the scatter seem so large."""
+"""Growth of the noise factor that widens the position once more. A single step aside and back does not reach it."""
 
 CONTRADICTION_SIGMAS = 5.0
+"""Standard deviations by which the rate of a track must differ from zero to contradict the receiver's velocities."""
+
 CONTRADICTION_RATE = 0.3
-"""Fixes move otherwise than the receiver's velocities beyond so many sigma and so many m/s."""
+"""m/s; a smaller rate of a track does not contradict the receiver's velocities."""
 
 
 @njit
 def patience(state, stream, source):
-    """Return how long (ns) an aid may be silent."""
+    """Return the time (ns) after which a silent stream and source counts as lost."""
     usual = MISSED_INTERVALS * state.streams.interval[stream, source]
     return min(max(usual, SHORTEST_PATIENCE), LONGEST_PATIENCE)
 
 
 @njit
 def is_live(state, stream, source):
-    """Say whether measurements of an aid come, accepted or not."""
+    """Say whether measurements of a stream and source arrive, accepted or not."""
     last = state.streams.last_stamp[stream, source]
     return last != NEVER and state.stamp - last <= patience(state, stream, source)
 
 
 @njit
 def is_fusing(state, stream, source):
-    """Say whether measurements of an aid are accepted."""
+    """Say whether measurements of a stream and source are being accepted."""
     last = state.streams.fused_stamp[stream, source]
     return last != NEVER and state.stamp - last <= patience(state, stream, source)
 
@@ -117,7 +139,7 @@ def is_led(state, source):
 
 @njit
 def update_track(state, aid, work):
-    """Show the track of a receiver its newest measurement, whose innovation and noise are in ``work``."""
+    """Update the track of a receiver with its newest measurement, whose innovation and noise are in ``work``."""
     if aid.stream == Stream.GNSS_POSITION:
         take_fix(state, aid.source, work)
     elif aid.stream == Stream.GNSS_VELOCITY:
@@ -126,7 +148,7 @@ def update_track(state, aid, work):
 
 @njit
 def take_velocity(state, source, work):
-    """Let a velocity lead the track, for the time since the one before; the first is a new beginning of the rate."""
+    """Let a velocity lead the track over the time since the one before; after a break the rate starts anew."""
     if not is_led(state, source):
         forget_rate(state, source)
         return
@@ -138,7 +160,7 @@ def take_velocity(state, source, work):
 
 @njit
 def take_fix(state, source, work):
-    """Let the track take a fix, if it belongs to it."""
+    """Update the track with a fix inside its gate; restart it after `MISSES` fixes in a row outside."""
     last = state.tracker.stamp[source]
     if last == NEVER or state.stamp - last > patience(state, Stream.GNSS_POSITION.value, source):
         start_track(state, source, work)
@@ -167,7 +189,7 @@ def take_fix(state, source, work):
 
 @njit
 def predict_track(state, source, work):
-    """Bring the track to the stamp of the newest fix; return the fix's normalised innovation squared."""
+    """Predict the track to the stamp of the newest fix; return the NIS of that fix (3 axes)."""
     dt = (state.stamp - state.tracker.stamp[source]) * 1e-9
     state.tracker.stamp[source] = state.stamp
     density = RATE_NOISE_DENSITY if is_led(state, source) else INERTIAL_NOISE_DENSITY
@@ -188,19 +210,19 @@ def predict_track(state, source, work):
 
 @njit
 def offset_of_fix(state, source, i, work):
-    """Return how far the newest fix is from the reckoned position that the velocities lead (m, axis ``i`` of map)."""
+    """Return the offset (m, axis ``i`` of map) of the newest fix from the reckoned position led by velocities."""
     return work.innovation[i] + state.tracker.corrections_map[i] - state.tracker.velocity_lead[source, i]
 
 
 @njit
 def offset_of_track(state, source, i):
-    """Return how far the track is from the position of the state (m, axis ``i`` of map)."""
+    """Return the offset (m, axis ``i`` of map) of the track from the position of the state."""
     return state.tracker.offset[source, i] + state.tracker.velocity_lead[source, i] - state.tracker.corrections_map[i]
 
 
 @njit
 def start_track(state, source, work):
-    """Start the track of a receiver anew from its newest fix."""
+    """Restart the track of a receiver from its newest fix."""
     state.tracker.stamp[source] = state.stamp
     state.tracker.hit_stamp[source] = state.stamp
     state.tracker.misses[source] = 0
@@ -214,7 +236,7 @@ def start_track(state, source, work):
 
 @njit
 def forget_rate(state, source):
-    """Begin again with the rate of the track."""
+    """Reset the rate of the track to zero, with the variance of an unknown rate."""
     for i in range(3):
         state.tracker.rate[source, i] = 0.0
         state.tracker.mixed_variance[source, i] = 0.0
@@ -223,7 +245,7 @@ def forget_rate(state, source):
 
 @njit
 def note_jump_of_fixes(state, source, work):
-    """Count a step aside of fixes that came without a break, with velocities that know nothing of it."""
+    """Count a jump: fixes without a break step aside, and the receiver's velocities do not show it."""
     if is_led(state, source) and state.stamp - state.tracker.hit_stamp[source] < UNBROKEN:
         square = 0.0
         for i in range(3):
@@ -235,7 +257,7 @@ def note_jump_of_fixes(state, source, work):
 
 @njit
 def forget_tracks(state):
-    """Forget what the fixes were like: the map or the state is another one."""
+    """Drop the tracks of all receivers, because the map frame or the state has changed."""
     for source in range(SOURCES):
         state.tracker.stamp[source] = NEVER
         state.tracker.misses[source] = 0
@@ -244,11 +266,12 @@ def forget_tracks(state):
 
 @njit
 def inflate_position_for_scatter(state, source, nis, work):
-    """Take into account how far a fix is from its track, as a factor on the variance it claims.
+    """Learn the scatter of the fixes about their track, and widen the position if fixes were trusted too much before.
 
-    Unless the track knows too little to tell.
-    Whenever the factor in use has grown to so much the position pays for what was believed before: it is less certain
-    by as much as a fix is.
+    ``nis`` is that of the newest fix about the predicted track. The running mean of the scatter is the factor on the
+    variances that the fixes claim (`gnss_position.noise_factor`). Whenever this factor has grown by `SCATTER_GROWTH`,
+    the variance of the position gains up to that of one fix, because earlier fixes were fused with too small a
+    variance.
     """
     for i in range(3):
         if state.tracker.offset_variance[source, i] > SCATTER_SHARE * work.noise[i, i]:
@@ -268,7 +291,7 @@ def inflate_position_for_scatter(state, source, nis, work):
 
 @njit
 def is_contradicted(state, source):
-    """Say whether the fixes of a receiver move otherwise than its velocities say."""
+    """Say whether the fixes of a receiver move in contradiction to its velocities."""
     if not is_led(state, source):
         return False
     square = 0.0

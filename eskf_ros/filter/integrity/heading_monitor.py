@@ -1,4 +1,8 @@
-"""Monitors: what is wrong with a whole stream, judged over windows and never by a single message."""
+"""Heading monitor: lasting differences of heading sensors, course and magnetic field from the estimate.
+
+Faults are judged over many messages and never by a single one. `complaints` puts them into sentences, together with
+those of the IMU (`imu_monitor`) and of velocities that are rejected for long.
+"""
 
 from __future__ import annotations
 
@@ -23,31 +27,40 @@ HEADING_MONITOR = np.dtype(
     ],
     align=True,
 )
-"""Sums of cosine and sine of a difference, and how many: dual antenna and magnetometer against the estimate, course
-over
-ground against the estimate. Strength (T) and inclination (rad) of the field last measured; disturbed fields, and all.
+"""Differences of headings from the estimate, and disturbed fields; sums and counts forget exponentially (`MEMORY`).
+
+``sensor_contrast``: sums of the cosine and the sine of the difference, and their number, for the dual antenna (0) and
+the magnetometer (1); ``course_contrast``: the same for the course over ground. ``field_found``: strength (T) and
+inclination (rad) of the field last measured; ``disturbed_fields``, ``field_count``: disturbed readings, and all.
 """
 
 
 MEMORY = 0.99
+"""Share of a sum that remains after each message: about 100 messages are remembered."""
+
 LASTING_COUNT = 40.0
+"""Messages from which on a difference is lasting, and rejections in a row that are worth a warning."""
+
 ALIKE = 0.9
+"""Mean resultant length (1: all equal) from which on angles agree, and share of disturbed fields that is reported."""
+
 FAR_OFF_DEG = 30.0
-"""Angles are remembered for some hundred messages; at least so many, so much alike, and on average so far from zero
-are no accident."""
+"""deg; smaller mean differences of headings are not reported."""
 
 LONG_REFUSED = 30.0
+"""s; velocities that are rejected for longer than this, while messages come, are reported."""
+
 REFUSED_CAUSES = {
     Stream.WHEEL: "wheel.time_offset, wheel.position, the scale of the speed (estimate.wheel_scale), or slip",
     Stream.BODY_VELOCITY: "body_velocity.mount_rpy_deg, body_velocity.mount_position, body_velocity.time_offset, or "
     "covariances that claim too much",
 }
-"""What may be wrong with velocities that are refused for so long (s) while they come."""
+"""What may be wrong with velocities that are rejected for `LONG_REFUSED`, by stream."""
 
 
 @njit
 def note_contrast(sums, angle):
-    """Add an angle (rad) to sums of cosine, sine and count that forget."""
+    """Add an angle (rad) to sums of cosine, sine and count, which forget exponentially."""
     sums[0] = MEMORY * sums[0] + math.cos(angle)
     sums[1] = MEMORY * sums[1] + math.sin(angle)
     sums[2] = MEMORY * sums[2] + 1.0
@@ -63,7 +76,7 @@ def watch_heading(state, aid, work):
 
 @njit
 def watch_field(state, is_disturbed):
-    """Count the readings of the magnetometer that cannot be the Earth's field; the counts forget."""
+    """Count the readings of the magnetometer, and those that cannot be the Earth's field (both counts forget)."""
     state.heading_monitor.field_count = MEMORY * state.heading_monitor.field_count + 1.0
     state.heading_monitor.disturbed_fields = MEMORY * state.heading_monitor.disturbed_fields + (
         1.0 if is_disturbed else 0.0
@@ -81,7 +94,7 @@ def watch_course(state, aid, heading, settings):
 
 
 def _lasting_difference(sums: np.ndarray) -> float | None:
-    """Return the mean (deg) of angles that were noted, if they were many, all alike and far from zero."""
+    """Return the mean angle (deg) of such sums, or None unless the angles are many, alike and far from zero."""
     cosine, sine, count = (float(value) for value in sums)
     if count < LASTING_COUNT or math.hypot(cosine, sine) < ALIKE * count:
         return None
@@ -90,12 +103,12 @@ def _lasting_difference(sums: np.ndarray) -> float | None:
 
 
 def is_heading_contradicted(state: np.void) -> bool:
-    """Say whether the dual antenna or the magnetometer tell another heading than the estimate for long."""
+    """Say whether the dual antenna or the magnetometer has a lasting difference from the estimated heading."""
     return any(_lasting_difference(sums) is not None for sums in state["heading_monitor"]["sensor_contrast"])
 
 
 def _refused_complaints(state: np.void) -> list[str]:
-    """Name the aids that are refused without end: one sentence each."""
+    """Return one sentence for each velocity stream that has been rejected for `LONG_REFUSED`."""
     found = []
     for stream, causes in REFUSED_CAUSES.items():
         count = int(state["streams"]["rejected"][stream, 0])
@@ -150,7 +163,7 @@ def _heading_complaints(state: np.void) -> list[str]:
 
 
 def complaints(state: np.void) -> list[str]:
-    """Say in one sentence each what is wrong with the IMU stream, and what to do; empty when nothing is."""
+    """Return one sentence for each fault of IMU, headings and rejected velocities, with what to do."""
     found = []
     if state["imu_monitor"]["odd_gravity_windows"] > max(1, int(state["imu_monitor"]["windows"]) // 4):
         strength = float(state["imu_monitor"]["odd_gravity"])

@@ -1,4 +1,4 @@
-"""Monitor of the IMU: gravity, mounting and rates, judged over static windows."""
+"""IMU monitor: gravity, mounting and rates, judged over static windows and never by a single sample."""
 
 from __future__ import annotations
 
@@ -25,31 +25,40 @@ IMU_MONITOR = np.dtype(
     ],
     align=True,
 )
-"""Static windows seen, those at rest, and those in which the IMU cannot be what it should be; still windows in a row
-with
-the same mean rate (rad/s), which is too large for a bias.
+"""Counts of static windows by what is wrong with the IMU in them.
+
+``windows``, ``rest_windows``: all windows, and those at rest. ``odd_gravity_windows``, ``odd_gravity``: the mean
+specific force cannot be gravity, and its last strength (m/s2). ``tilted_windows``, ``tilted_force``: at rest gravity is
+far from the z axis of base_link, and the last mean force (m/s2, base_link). ``fast_windows``: the mean rate is
+impossible. ``biased_windows``, ``biased_rate``: still windows in a row with the same mean rate (rad/s, IMU axes) that
+is too large for a bias.
 """
 
 NO_GRAVITY = 0.5
-"""Below this part of gravity on average the accelerometer cannot be a strapdown one in m/s2, at rest or not."""
+"""Share of standard gravity below which no strapdown accelerometer in m/s2 reads on average, at rest or in motion."""
 
 GRAVITY_TOLERANCE = 0.2
+"""Share of standard gravity by which the mean specific force at rest may differ from it."""
 
 UPRIGHT_COSINE = 0.7
+"""Cosine of the largest angle (45 degrees) between the mean specific force at rest and the z axis of base_link."""
 
 FASTEST_TURN = 15.0
-"""At rest gravity is within this part of its value and within 45 degrees of the z axis of base_link; nothing that
-navigates turns this fast (rad/s) for seconds."""
+"""rad/s; no vehicle turns faster than this on average over a window."""
 
 SAME_RATE = 0.1
+"""Share of the mean rate by which it may change from one still window to the next and still be a constant bias."""
 
 BIASED_WINDOWS = 3
-"""A rate that changes by less than this part from window to window, through so many, is a bias: nothing turns so."""
+"""Still windows in a row with the same mean rate that prove a bias: no robot turns that evenly."""
 
 
 @njit
 def watch_input(state, still, settings):
-    """Judge the full stillness window: strength of gravity, its direction in base_link, size of the rates."""
+    """Judge the full static window: strength of gravity, its direction in base_link, size of the rates.
+
+    ``still``: the readings are as quiet as at rest.
+    """
     n = state.window.samples
     force = (state.window.total[0] / n, state.window.total[1] / n, state.window.total[2] / n)
     rate = (state.window.total[3] / n, state.window.total[4] / n, state.window.total[5] / n)
@@ -75,7 +84,7 @@ def watch_input(state, still, settings):
 
 @njit
 def watch_bias(state, rate, settings):
-    """Count still windows in a row with one mean rate (rad/s) that is too large for what is expected of the bias."""
+    """Count still windows in a row with the same mean rate (rad/s, IMU axes) that exceeds the expected gyro bias."""
     nothing = (0.0, 0.0, 0.0)
     if can_be_bias(rate, nothing, settings.gyro_bias_std, 0.0):
         state.imu_monitor.biased_windows = 0

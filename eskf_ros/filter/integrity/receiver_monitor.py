@@ -1,14 +1,14 @@
-"""Monitors of the GNSS receivers: what their innovations say of faults that no single message shows.
+"""Receiver monitor: faults of GNSS receivers that no single message shows, found from their innovations.
 
-- A lever arm or a time offset that is wrong: the antenna is R dl + v dt from where it is looked for. What such a fault
-  does to the state is followed through every update, and the innovations are compared with what is left of it
-  (Friedland, Treatment of bias in recursive filtering, 1969).
-- A receiver that leaves the path that the IMU measures: cumulated sums of the innovations (Page,
-  Continuous inspection schemes, 1954).
-- Covariances that are too small or too large, and a filter that is too sure of itself after outages.
-- A heading that does not become known although the robot moves.
+- Wrong lever arm or time offset: the antenna is R dl + v dt away from where the filter expects it. The effect of such a
+  fault on the state is carried through every prediction and update, and the innovations are compared with what remains
+  of it (Friedland, Treatment of bias in recursive filtering, 1969).
+- A receiver that drifts away from the path that the IMU measures: CUSUM of the innovations (Page, Continuous inspection
+  schemes, 1954).
+- Covariances that are too small or too large, and a filter that is overconfident after outages.
+- A heading that does not become more certain although the robot moves.
 
-All sums are of the state and rewound with it.
+All sums are part of the state, so that a rewind restores them.
 """
 
 from __future__ import annotations
@@ -54,57 +54,87 @@ RECEIVER_MONITOR = np.dtype(
     ],
     align=True,
 )
-"""Monitors of the GNSS receivers.
+"""Sums and counts of the monitors, by receiver.
 
-``fault_*``: effect of faults on the state so far, and normal equations; ``drift_sums``: innovations up and down on two
-axes; ``departures`` and the rest: counts, means and sums.
+- ``fault_stamp``, ``fault_force``: stamp (ns) and specific force (m/s2, map) of the last step of the fault estimation.
+- ``fault_absorbed``: derivative of the 15 errors of the core by the faults.
+- ``fault_information``, ``fault_evidence``: normal equations of the faults.
+- ``drift_sums``: CUSUM of the innovations, upwards and downwards, on two axes.
+- ``departures``, ``departure_stamp``: how often a CUSUM reached its threshold, and when first (ns).
+- ``seen_stamp``, ``fix_count``: the last fix (ns), and the number of fixes.
+- ``scattered_fixes``, ``scatter_sum``: fixes with inflated noise, and the sum of their factors.
+- ``contradicted_fixes``, ``contradiction_rate``: fixes that contradict the velocities, and the largest difference
+  (m/s).
+- ``velocity_nis``: running mean of the NIS of the velocities per degree of freedom, and their number.
+- ``coasts``, ``coast_nis``: outages, and the sum of the NIS per degree of freedom of the first fixes after them.
+- ``heading_mark_stamp``, ``heading_mark_std``: the last check of the heading (ns), and its standard deviation (rad).
+- ``heading_stuck``: checks in a row without progress.
 """
 
 FAULTS = 4
+"""Faults that are estimated for each receiver: three axes of the lever arm (m, body), and the time offset (s)."""
+
 TIME = 3
-"""Three axes of the lever arm (m, body), and the time offset (s)."""
+"""Index of the time offset among the faults."""
 
 MEMORY = 600.0
-"""Faults are learnt from about so many seconds."""
+"""s; time constant with which the normal equations of the faults forget."""
 
 FAULT_PRIOR = (5.0, 5.0, 5.0, 1.0)
+"""Prior standard deviations of the faults (m, m, m, s)."""
+
 FAULT_SIGMAS = 6.0
+"""Standard deviations from zero beyond which a fault is reported."""
+
 LEVER_ARM_ERROR = 0.05
+"""m; smaller errors of the lever arm are not reported."""
+
 TIME_ERROR = 0.01
-"""What a fault may be at the most (m, m, m, s), and when it is named: beyond so many sigma and so much."""
+"""s; smaller time offsets are not reported."""
 
 DRIFT_ALLOWANCE = 0.5
+"""CUSUM allowance (sigma): the part of each innovation that the sum does not count."""
+
 DRIFT_LIMIT = 16.0
-"""A sum of innovations, in sigma, less so much each, that reaches this happens by chance once in hundreds of hours."""
+"""CUSUM threshold (sigma): white innovations reach it by chance about once in hundreds of hours."""
 
 FEW_DEPARTURES = 3
-"""So often it may be reached by errors of fixes that last."""
+"""A drift is reported from this many threshold crossings on: correlated errors of fixes may cause fewer."""
 
 LONG_COAST = 5_000_000_000
+"""ns; shorter outages are not judged."""
+
 MANY_FIXES = 50
-"""An outage that counts (ns); so few fixes or velocities prove nothing."""
+"""Fixes that a receiver must have sent before anything of it is reported. Velocities need twice as many."""
 
 FEW_FIXES = 5
-"""So many that move otherwise than the velocities are an accident."""
+"""Contradicted fixes up to this number may be an accident and are not reported."""
 
 MODEST_SCATTER = 0.12
+"""Scatter of the fixes over the standard deviation they claim, below which the claim is reported as too large."""
+
 HIGH_NIS = 2.0
+"""Mean NIS of the velocities per degree of freedom above which their covariances are reported as too small."""
+
 NIS_CLIP = 10.0
+"""Largest NIS per degree of freedom that a velocity counts with; the first fix after an outage: its square."""
+
 NIS_GAIN = 0.01
-"""Sigma by which fixes scatter, as a share of what they claim; mean NIS of velocities and the most that one counts, per
-degree of freedom."""
+"""Weight of the newest velocity in the running mean of the NIS."""
 
 UNLIKELY = 1e-4
-"""Chance that outages end as badly with a filter that is honest."""
+"""Probability below which the innovations after outages contradict a consistent filter (chi-square test)."""
 
 HEADING_INTERVAL = 60_000_000_000
+"""ns; time between two checks whether the heading has become more certain."""
+
 SHRINKING = 0.9
-"""While a robot moves the sigma of its heading shrinks at least to this share in this time (ns), until it is good."""
+"""Share to which the standard deviation of the heading has to shrink from one check to the next, until it is good."""
 
 
 @njit
 def watch_aid(state, aid, size, gate, work, settings):
-    """Learn from a measurement that went through the update; ``gate`` and ``work`` as they were for it."""
+    """Update the monitors with a measurement after its update; ``gate`` and ``work`` as the update had them."""
     learn_faults(state, aid, size, gate, work, settings)
     if aid.stream == Stream.GNSS_POSITION:
         watch_fix(state, aid)
@@ -118,7 +148,10 @@ def watch_aid(state, aid, size, gate, work, settings):
 
 @njit
 def write_effect(state, aid, work, settings):
-    """Write what the faults of a receiver add to its measurement to ``work.effect`` (3, 4); zero for all other aids."""
+    """Write the derivative of a measurement by the faults of its receiver to ``work.effect`` (3, 4).
+
+    It is zero for all streams but GNSS position and velocity.
+    """
     effect = work.effect
     for i in range(3):
         for k in range(FAULTS):
@@ -145,12 +178,12 @@ def write_effect(state, aid, work, settings):
 
 @njit
 def learn_faults(state, aid, size, gate, work, settings):
-    """Follow what faults have done to the state, and compare the innovation with what is left of them."""
+    """Carry the effect of the faults on the state through one update, and learn from its innovation."""
     if state.heading_known == 0:
         state.receiver.fault_stamp = NEVER
         return
     if state.receiver.fault_stamp == NEVER:
-        state.receiver.fault_absorbed[:] = 0.0
+        state.receiver.fault_absorbed.fill(0.0)
     dt = carry_absorbed(state)
     accepted = aid.verdict in (Verdict.FUSED, Verdict.WEIGHED_DOWN)
     for source in range(SOURCES):
@@ -180,9 +213,10 @@ def learn_faults(state, aid, size, gate, work, settings):
 
 @njit
 def carry_absorbed(state):
-    """Let what the state has absorbed of the faults act until now; return the time (s) since the last measurement.
+    """Carry the effect of the faults on the state to the present; return the time (s) since the last measurement.
 
-    In one step of trapezoids: exact enough for a second of a car, and the sums are forgiving.
+    One step of the trapezoidal rule: exact enough for a second of a car's motion, and the fault estimates tolerate
+    more.
     """
     rotation = to_matrix(state.attitude)
     f, b = state.specific_force, state.accel_bias
@@ -214,7 +248,10 @@ def carry_absorbed(state):
 
 @njit
 def weigh_faults(state, source, dt, weight, work):
-    """Add one innovation to the normal equations of the faults; ``work.innovation_covariance`` is inverted already."""
+    """Add one innovation to the normal equations of the faults; ``work.innovation_covariance`` is inverted already.
+
+    ``dt`` (s): the time since the last measurement; ``weight``: below 1 for an innovation outside the gate.
+    """
     inverse, effect = work.innovation_covariance, work.effect
     remains = max(0.0, 1.0 - dt / MEMORY)
     for k in range(FAULTS):
@@ -232,7 +269,7 @@ def weigh_faults(state, source, dt, weight, work):
 
 @njit
 def watch_fix(state, aid):
-    """Count fixes that claim too much, contradict the velocities, or come after an outage."""
+    """Count fixes with inflated noise, fixes that contradict the velocities, and first fixes after an outage."""
     source = aid.source
     state.receiver.fix_count[source] += 1
     if NEVER < state.receiver.seen_stamp[source] < state.stamp - LONG_COAST and state.heading_known == 1:
@@ -252,7 +289,7 @@ def watch_fix(state, aid):
 
 @njit
 def watch_velocity(state, aid):
-    """Keep the mean of the normalised innovations squared of the velocities."""
+    """Update the running mean of the NIS of the velocities, per degree of freedom."""
     nis = min(aid.nis / 3.0, NIS_CLIP)
     sums = state.receiver.velocity_nis[aid.source]
     sums[0] += NIS_GAIN * (nis - sums[0])
@@ -261,19 +298,19 @@ def watch_velocity(state, aid):
 
 @njit
 def watch_departure(state, source, work):
-    """Add the innovation to the sums for both directions of the horizontal axes; count those that reach the limit.
+    """Update the CUSUM of the innovations in both directions of the horizontal axes; count threshold crossings.
 
-    Of the velocities, where there are any: errors of fixes are alike for seconds.
+    It sums the innovations of the velocities where there are any, because errors of fixes are correlated for seconds.
     """
     sums = state.receiver.drift_sums[source]
     for i in range(2):
-        # The diagonal of the inverse is at most the inverse of the diagonal.
+        # The matrix is inverted already; its diagonal is at least the inverse of the variance.
         sigmas = work.innovation[i] * math.sqrt(work.innovation_covariance[i, i])
         sigmas = max(-3.0, min(3.0, sigmas))
         sums[2 * i] = max(0.0, sums[2 * i] + sigmas - DRIFT_ALLOWANCE)
         sums[2 * i + 1] = max(0.0, sums[2 * i + 1] - sigmas - DRIFT_ALLOWANCE)
     if max(max(sums[0], sums[1]), max(sums[2], sums[3])) >= DRIFT_LIMIT:
-        sums[:] = 0.0
+        sums.fill(0.0)
         if state.receiver.departures[source] == 0:
             state.receiver.departure_stamp[source] = state.stamp
         state.receiver.departures[source] += 1
@@ -281,7 +318,7 @@ def watch_departure(state, source, work):
 
 @njit
 def watch_heading_std(state, settings):
-    """Look every minute whether the heading has become better while the robot moved."""
+    """Check every minute whether the standard deviation of the heading has shrunk while the robot moved."""
     if state.stamp - state.receiver.heading_mark_stamp < HEADING_INTERVAL:
         return
     std = math.sqrt(state.covariance[ATTITUDE + 2, ATTITUDE + 2]) if state.heading_known == 1 else math.pi
@@ -294,14 +331,14 @@ def watch_heading_std(state, settings):
 
 
 def aid_complaints(state: np.void, settings: np.void) -> list[str]:
-    """Say in one sentence each what is wrong with the receivers, and what to do; empty when nothing is."""
+    """Return one sentence for each fault of the receivers, with what to do; empty without faults."""
     found = []
     for source in range(SOURCES):
         if state["receiver"]["fix_count"][source] < MANY_FIXES:
             continue
         faults = _fault_complaints(state, settings, source)
         lies = _covariance_complaints(state, source, float(settings["gnss_covariance_scale"]))
-        # What follows from those needs no sentence of its own.
+        # Those faults explain drifts, contradictions and a high NIS: no sentences of their own.
         found += faults + lies
         if not faults and not lies:
             found += _path_complaints(state, source)
@@ -322,7 +359,7 @@ def _of(source: int) -> str:
 def estimated_faults(state: np.void, source: int) -> tuple[np.ndarray, np.ndarray]:
     """Return lever arm error (m, body) and time offset (s), true minus configured, and their sigmas: (4,) each.
 
-    Innovations that are larger than expected make them less certain.
+    Innovations and a scatter that are larger than expected widen the sigmas.
     """
     scattered = max(1, int(state["receiver"]["scattered_fixes"][source]))
     excess = max(
@@ -339,7 +376,7 @@ def estimated_faults(state: np.void, source: int) -> tuple[np.ndarray, np.ndarra
 def _fault_complaints(state: np.void, settings: np.void, source: int) -> list[str]:
     estimate, sigma = estimated_faults(state, source)
     significance = np.abs(estimate) / sigma
-    # A large fault leaves something of itself in the estimates of the others.
+    # A large fault leaks into the estimates of the others.
     certain = significance > max(FAULT_SIGMAS, 0.3 * significance.max())
     group = "gnss" if source == 0 else "second_gnss"
     clock = "ranges" if source == 0 and settings["solves_ranges"] else group

@@ -1,19 +1,21 @@
-"""Recovery: who is right when a receiver and the filter disagree, and what becomes of the one that is not.
+"""Recovery: decide who is right when a receiver and the filter disagree, and reset the one that is wrong.
 
-The track of a receiver (see ``track``) answers that without the filter's own opinion:
+The fix tracker (`fix_tracker`) judges a receiver by its own fixes, without the filter's opinion:
 
-- Fixes scatter more than they claim: their noise is taken as what it is (``gnss_position.noise_factor``).
-- They move otherwise than the receiver's velocities: they are not fused while they do (spoofing, multipath).
-- Those that the filter rejects agree with each other: when they have done so for longer than the filter had its own
-  support, they win, and position and velocity are reset. The alignment starts again only when that does not help.
+- Fixes scatter more than their covariances claim: their noise is inflated (`gnss_position.noise_factor`).
+- Fixes move otherwise than the receiver's velocities (spoofing, multipath): they are not fused while they do.
+- Fixes that the filter rejects agree with each other: when they have done so for longer than the filter had been fusing
+  before them, they win, and position and velocity are reset to them. The alignment restarts only if resets do not help.
 
-A fix not far outside the gate corrects a little: where the IMU was worse than its parameters say, a filter that ignores
-the first fix outside the gate ignores all that follow, because its error and its sigma grow alike.
+A fix just outside the innovation gate is fused with inflated noise. Where the IMU is worse than its parameters say, the
+error of the filter and its standard deviation grow at the same rate: a filter that rejects the first fix outside the
+gate would reject all that follow.
 
-A heading that was given does not hold against a dual antenna that it was never reconciled with (``heading_hints``).
+A heading that was given (parameter, memory or pose) loses against a dual antenna that has never agreed with it
+(`heading_sensors`).
 
-A receiver whose accuracy changes at once has another kind of solution (single, float, fixed), and what lasted in the
-error of the old one says nothing about the new one.
+A sudden change of the accuracy that a receiver claims means another kind of solution (single, float, fixed). What was
+learnt of the correlated error of the old solution does not hold for the new one.
 """
 
 from __future__ import annotations
@@ -45,45 +47,61 @@ RECOVERY = np.dtype(
     ],
     align=True,
 )
-"""When absolute measurements were last accepted, how many were rejected since and from when on; resets of position and
-velocity, the last one, and how often lately.
+"""Acceptance of absolute positions (fixes and epochs of pseudoranges), and resets of position and velocity.
+
+``absolute_stamp``, ``absolute_interval``: the last accepted one (ns), and the time from the one before it (ns).
+``rejected_fixes``, ``rejected_since``: how many were rejected since then, and the stamp of the first of them (ns).
+``resets``: all resets; ``reset_stamp``: the last one (ns); ``recent_resets``: resets in a row, each within
+`RESET_HELPS` of the one before.
 """
 
 MEMBERS = 5
+"""Rejected fixes, at least, that must agree with each other to win over the filter."""
+
 LEAST_SUPPORT = 1_000_000_000
+"""ns; rejected fixes must agree for at least this long to win over the filter, even right after an outage."""
+
 FULL_SUPPORT = 10_000_000_000
-"""So many rejected fixes must agree with each other to win over the filter, and do so for as long (ns) as it had been
-fusing right before them, within these limits: a multipath step is shorter than the full time."""
+"""ns; rejected fixes must agree for as long as the filter had been fusing before them, but no longer than this: a
+multipath step is shorter.
+"""
 
 AGAINST_INERTIAL = 30_000_000_000
+"""ns; rejected fixes must agree for this long if the filter had full support and they contradict its velocity, too."""
+
 INERTIAL_SIGMAS = 5.0
-"""... and for this long when they contradict its velocity too, by so many sigma."""
+"""Standard deviations by which the track of the fixes must move to contradict the velocity of the filter."""
 
 LAST_RESORT = 60_000_000_000
+"""ns; the alignment restarts if neither a fix nor a GNSS velocity was accepted for this long while fixes came."""
+
 RESETS = 3
+"""Resets in a row without lasting success after which the alignment restarts."""
+
 RESET_HELPS = 20_000_000_000
-"""The alignment starts again when fixes have come in vain for so long (ns), or after so many resets, none of which
-helped for so long."""
+"""ns; a reset has helped if the next one comes later than this."""
 
 RESTART_HELPS = 300_000_000_000
-"""If after a new alignment, within this time (ns), resets do not help either, alignment is not what is wrong."""
+"""ns; if resets still do not help within this time after a restart, the alignment is not the cause: it stays."""
 
 NEAR_GATE = 4.0
-"""Up to so many times the gate (twice the innovation) a filter may be too sure of itself; beyond, the fix is wrong."""
+"""Multiple of the gate (in NIS; 4 is twice the innovation) up to which a fix is weighed down: the filter may be
+overconfident. Further outside, the fix is taken for wrong and rejected.
+"""
 
 REJECTED_PRESSURE = 5_000_000_000
-"""So long (ns) pressures are rejected before their offset is taken for another one."""
+"""ns; when no pressure has been accepted for longer, the offset of the pressure altitude is reset."""
 
 NOTHING_PASSES = -1.0
-"""A gate."""
+"""Innovation gate (NIS) that no measurement passes, because a NIS is never negative: for contradicted fixes."""
 
 SAME_SOLUTION = 4.0
-"""A variance changes by no more than this factor from one fix to the next of the same kind of solution."""
+"""Largest ratio of the variances of two consecutive fixes of the same kind of solution."""
 
 
 @njit
 def reset_for_new_solution(state, aid, settings):
-    """Begin again with what was learnt of the errors of the fixes when the receiver changes its kind of solution."""
+    """Reset the learnt scatter and the correlated error of fixes when the receiver changes its kind of solution."""
     if aid.stream != Stream.GNSS_POSITION:
         return
     variance = aid.payload[3] + aid.payload[6]
@@ -97,7 +115,7 @@ def reset_for_new_solution(state, aid, settings):
 
 @njit
 def phase_of(state, stream, source):
-    """Return the phase of an aid at the stamp of the state."""
+    """Return the `Phase` of a stream and source at the stamp of the state."""
     if state.streams.last_stamp[stream, source] == NEVER:
         return Phase.WAITING
     if not is_live(state, stream, source):
@@ -116,7 +134,7 @@ def phase_of(state, stream, source):
 
 @njit
 def gate_of(state, aid, size, settings):
-    """Return the largest normalised innovation squared that is accepted."""
+    """Return the innovation gate of a measurement: the largest NIS that is accepted."""
     if aid.stream == Stream.GNSS_POSITION and is_contradicted(state, aid.source):
         return NOTHING_PASSES
     return settings.gate[aid.stream, size]
@@ -124,11 +142,11 @@ def gate_of(state, aid, size, settings):
 
 @njit
 def recover(state, aid, size, gate, settings, work):
-    """Note what became of a measurement; let rejected ones that agree with each other win over the filter.
+    """Decide what follows from the verdict of an update, and count it; rejected fixes that agree may win.
 
-    ``gate`` as it was for the update of this measurement, ``size`` scalars described by ``work``. A pressure outside
-    its gate for long means that a door or a fan has changed it for good: it says nothing of the height, but soon again
-    of its changes.
+    ``gate`` is the one of this update, ``size`` the number of scalars in ``work``. When pressures have been rejected
+    for `REJECTED_PRESSURE`, a door or a fan has changed the pressure for good: the offset is reset, so that the
+    barometer says nothing of the height, but soon again of its changes.
     """
     stream, source = aid.stream, aid.source
     if stream >= SENSOR_STREAMS:
@@ -159,7 +177,7 @@ def recover(state, aid, size, gate, settings, work):
 
 @njit
 def note_epoch(state, verdict):
-    """Note what became of most pseudoranges of an epoch."""
+    """Count the verdict of most pseudoranges of an epoch; restart the alignment if the filter is lost."""
     note(state, Stream.PSEUDORANGE.value, 0, verdict)
     if is_lost(state):
         reset_alignment(state)
@@ -167,7 +185,7 @@ def note_epoch(state, verdict):
 
 @njit
 def update_weighed_down(state, size, excess, work):
-    """Fuse what ``work`` describes with so much more noise that its NIS, ``excess`` gates, is on the gate."""
+    """Fuse the measurement in ``work``, its NIS ``excess`` times the gate, with noise that brings it onto the gate."""
     project(state, size, work)
     for a in range(size):
         for b in range(size):
@@ -177,7 +195,7 @@ def update_weighed_down(state, size, excess, work):
 
 @njit
 def note(state, stream, source, verdict):
-    """Keep the times and counts of an aid."""
+    """Update the stamps and counters of a stream and source with the verdict of its newest measurement."""
     last = state.streams.last_stamp[stream, source]
     if last != NEVER:
         interval = state.streams.interval[stream, source]
@@ -213,7 +231,7 @@ def note(state, stream, source, verdict):
 
 @njit
 def has_won(state, source):
-    """Say whether the rejected fixes of a receiver have agreed with each other for long enough."""
+    """Say whether the rejected fixes of a receiver have agreed with each other for long enough to reset the filter."""
     if (
         state.tracker.misses[source] > 0
         or state.tracker.rejected[source] + 1 < MEMBERS
@@ -232,7 +250,7 @@ def has_won(state, source):
 
 @njit
 def is_against_inertial(state, source):
-    """Say whether a receiver contradicts the filter in velocity too, in which the IMU has its say."""
+    """Say whether the fixes of a receiver contradict the velocity of the filter, too, which the IMU supports."""
     if is_live(state, Stream.GNSS_VELOCITY.value, source):
         return not is_fusing(state, Stream.GNSS_VELOCITY.value, source)
     for i in range(3):
@@ -244,14 +262,15 @@ def is_against_inertial(state, source):
 
 @njit
 def reset_to_fixes(state, source, settings, work):
-    """Put position and velocity where the track of a receiver is; attitude and biases stay as they are.
+    """Reset position and velocity to the track of a receiver; attitude and biases stay as they are.
 
-    The position is no more certain than one fix: errors of fixes are alike. A velocity that agrees with the receiver's
-    stays; if the receiver gives none it is that of the track, else it is open to the next one.
+    The variance of the position is at least that of one fix, because errors of fixes are correlated. The velocity stays
+    while the receiver's velocities are accepted. Otherwise it is that of the track or, if the receiver sends
+    velocities, its variance is opened to `START_VELOCITY_STD` for the next one.
     """
     covariance = state.covariance
     reset_error(covariance, POSITION)
-    # What lasts in the errors of fixes was taken out of the noise, and is in the position again.
+    # The noise lacks the correlated share of the variance of a fix; the error of the reset position contains it.
     whole = 1.0 / (1.0 - settings.correlated_share) if settings.position_error_at < state.error_size else 1.0
     for i in range(3):
         state.position_map[i] += offset_of_track(state, source, i)
@@ -277,7 +296,7 @@ def reset_to_fixes(state, source, settings, work):
 
 @njit
 def reset_error(covariance, place):
-    """Take the correlations of three errors, and their variances."""
+    """Zero the variances and correlations of the three errors from index ``place``."""
     for i in range(place, place + 3):
         for j in range(ERROR_CAPACITY):
             covariance[i, j] = 0.0
@@ -286,7 +305,7 @@ def reset_error(covariance, place):
 
 @njit
 def is_lost(state):
-    """Say whether only a new alignment is left: resets do not help, or neither fixes nor velocities are accepted."""
+    """Say whether only a new alignment can help: resets did not, or neither fixes nor velocities are accepted."""
     is_new = state.restarts > 0 and state.stamp - state.first_stamp < RESTART_HELPS
     if state.recovery.recent_resets >= RESETS:
         return not is_new

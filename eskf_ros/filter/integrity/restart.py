@@ -1,4 +1,4 @@
-"""The alignment starts again: after a long silence of the IMU, or when the estimate is not to be believed."""
+"""Restart of the alignment: after a long silence of the IMU, or when the estimate cannot be trusted any more."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from eskf_ros.filter.state.time import NEVER
 
 @njit
 def reset_alignment(state):
-    """Start the alignment again; only the datum stays."""
+    """Restart the alignment: level, position and heading are unknown again; the datum stays."""
     state.restarts += 1
     forget_search(state)
     forget_tracks(state)
@@ -25,10 +25,10 @@ def reset_alignment(state):
     state.window.start = NEVER
     state.window.still_stamp = NEVER
     state.window.still_samples = 0
-    # What was learnt of the receivers was learnt with an attitude that is not believed any more.
+    # The faults of the receivers were learnt with an attitude that is not trusted any more.
     state.receiver.fault_stamp = NEVER
-    state.receiver.fault_information[:] = 0.0
-    state.receiver.fault_evidence[:] = 0.0
+    state.receiver.fault_information.fill(0.0)
+    state.receiver.fault_evidence.fill(0.0)
     for i in range(2):
         state.tight.clock_known[i] = 0
     for i in range(3):

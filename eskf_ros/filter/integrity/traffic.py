@@ -1,4 +1,4 @@
-"""What became of the messages before they entered the timeline, by stream, and the sentences that follow from it."""
+"""Counts of the messages before they enter the timeline, by stream, and the warnings that follow from them."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ DOOR_REMEDIES = {
     "stands for unknown), covariances smaller",
     Verdict.BAD_VALUE: "carry values that cannot be true: look at units and fields",
 }
-"""What is said when most messages of a stream are refused for what they contain."""
+"""Warnings for streams whose messages are mostly refused for their contents, by verdict."""
 
 FEWEST_REFUSED = 10
-"""Messages of a stream that have to be refused for what they contain before it is said."""
+"""Messages of a stream refused for their contents from which on the warning appears."""
 
 
 @dataclass
 class Traffic:
-    """Counts by stream since the start, of messages that a filter was offered."""
+    """Counts, by stream, of the messages that a filter was offered since its start."""
 
     offered: Counter[Stream] = field(default_factory=Counter)
     refused: Counter[Stream] = field(default_factory=Counter)
-    """Those that never entered the timeline, because of their stamp."""
+    """Messages that never entered the timeline because of their stamp."""
     shut_doors: Counter[tuple[Stream, Verdict]] = field(default_factory=Counter)
-    """Those refused for what they contain."""
+    """Messages refused for their contents, by stream and verdict."""
     early: Counter[Stream] = field(default_factory=Counter)
-    """Those dropped because too many waited for the first IMU sample."""
+    """Messages dropped because too many were already waiting for the first IMU sample."""
     stamp_difference: dict[Stream, float] = field(default_factory=dict)
     """Stamp of the last refused message minus that of the newest IMU sample (s)."""
     stand_ins: int = 0
     """Messages that came without a covariance."""
     field_problem: str = ""
-    """Why the Earth's magnetic field is not known."""
+    """Why the Earth's magnetic field is unknown; empty while it is not."""
 
     def note_refused(self, stream: Stream, stamp: int, frontier: int) -> None:
         """Count a message with a stamp (ns) that the timeline refused; ``frontier``: the newest IMU stamp."""
@@ -46,7 +46,7 @@ class Traffic:
             self.stamp_difference[stream] = (stamp - frontier) / SECOND
 
     def complaints(self) -> list[str]:
-        """What is wrong with whole streams, one sentence each with what to do; empty when nothing is."""
+        """Return one sentence for each faulty stream, with what to do; empty without faults."""
         found = [self.field_problem] if self.field_problem else []
         for (stream, verdict), count in self.shut_doors.items():
             offered = self.offered[stream]
@@ -68,7 +68,7 @@ class Traffic:
         return found
 
     def notes(self) -> list[str]:
-        """What is worth knowing of the streams though nothing is wrong: one sentence each."""
+        """Return one sentence for each fact worth knowing of the streams though nothing is wrong."""
         if not self.stand_ins:
             return []
         return [

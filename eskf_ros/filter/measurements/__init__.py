@@ -1,1 +1,1 @@
-"""One file per aid: prediction, innovation, Jacobian, noise; nothing else."""
+"""Measurement models, one file each; only `kalman_update` and the error of `mag` write the estimate."""

@@ -36,10 +36,13 @@ from eskf_ros.geodesy.rotation import cross, rotate, rotate_back, to_matrix
 from eskf_ros.parameters.schema import Aid, parameter
 
 STANDARD_PRESSURE = 101325.0
+"""Pa; pressure of the standard atmosphere at sea level."""
+
 TEMPERATURE_HEIGHT = 288.15 / 0.0065
-"""The height (m) at which a temperature that falls on like in the troposphere would be zero."""
+"""m; height at which the temperature would be zero with the tropospheric lapse rate of the standard atmosphere."""
 
 EXPONENT = 8.31432 * 0.0065 / (9.80665 * 0.0289644)
+"""Exponent of the pressure in the standard atmosphere: gas constant times lapse rate over gravity times molar mass."""
 
 
 @njit
@@ -50,7 +53,7 @@ def pressure_altitude(pressure):
 
 @njit
 def place_of_sensor(state, settings):
-    """Return latitude, longitude (rad) and height (m) of the barometer, and its place from the IMU in map axes."""
+    """Return latitude, longitude (rad) and height (m) of the barometer, and its lever arm (m, map axes)."""
     p, arm = state.position_map, settings.baro.arm_body
     lever = rotate(to_matrix(state.attitude), (arm[0], arm[1], arm[2]))
     offset = rotate(state.frame.map_to_ecef, (p[0] + lever[0], p[1] + lever[1], p[2] + lever[2]))
@@ -60,7 +63,7 @@ def place_of_sensor(state, settings):
 
 @njit
 def predict(state, source, settings):
-    """Return the pressure altitude (m) of the barometer."""
+    """Return the pressure altitude (m) that the barometer should measure."""
     (_, _, height), _ = place_of_sensor(state, settings)
     offset = state.optional[settings.baro_offset_at - ERROR_SIZE]
     scale = state.optional[settings.baro_scale_at - ERROR_SIZE]
@@ -133,17 +136,17 @@ class Baro(Aid):
 
 
 SETTINGS = np.dtype([("arm_body", "f8", (3,))], align=True)
-"""Where the barometer sits (m from the IMU, in its axes)."""
+"""Lever arm of the barometer (m, IMU axes)."""
 
 HIGHEST_PRESSURE = 1.2e5
 """Pa; no barometer on a robot reports more."""
 
 LOWEST_PRESSURE = 1.0e4
-"""Pa, at 16 km; what a driver that reports hectopascal sends is below it."""
+"""Pa, at a height of 16 km; drivers that report hectopascal send less."""
 
 
 def read(messages: npt.NDArray[Any]) -> Readings:
-    """Air pressure (Pa); the other axes are absent."""
+    """Return pressures (Pa) with their variances; the other two axes are absent."""
     values, covariances = np.zeros((len(messages), 3)), np.zeros((len(messages), 9))
     values[:, 0] = messages["fluid_pressure"]
     covariances[:, 0] = messages["variance"]
@@ -152,7 +155,7 @@ def read(messages: npt.NDArray[Any]) -> Readings:
 
 
 def limits(baro: Baro) -> dict[str, Any]:
-    """Particulars of the `Intake`."""
+    """Return the fields of the `Intake` that the parameters of this measurement determine."""
     return {
         "std_floor": threefold(baro.std_floor),
         "unknown_std": threefold(baro.unknown_std),
@@ -163,14 +166,14 @@ def limits(baro: Baro) -> dict[str, Any]:
 
 
 def describe(settings: np.void, parameters: Any) -> None:
-    """Fill in `SETTINGS`."""
+    """Fill `SETTINGS` from the parameters."""
     settings["arm_body"] = arm_body(parameters.baro.position, parameters)
 
 
 def augmented(parameters: Any) -> tuple[OptionalBlock, ...]:
-    """Weather and geoid, and the temperature of the air.
+    """Return offset (weather, geoid) and scale (temperature of the air) of the pressure altitude.
 
-    Not by whether the sensor is used, which may change while running: places stay.
+    They are there whether or not the sensor is used, because use may change while running and indices may not.
     """
     baro: Baro = parameters.baro
     return (

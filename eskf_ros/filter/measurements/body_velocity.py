@@ -31,19 +31,19 @@ from eskf_ros.geodesy.rotation import cross, dot, to_matrix
 from eskf_ros.parameters.schema import Aid, parameter
 
 COVARIANCES = ((3, 4, 5), (4, 6, 7), (5, 7, 8))
-"""Where the covariance of two axes is in the payload."""
+"""Index in the payload of the covariance of two axes."""
 
 
 @njit
 def axis_of(settings, i):
-    """Return an axis of the sensor as a unit vector in IMU axes."""
+    """Return axis ``i`` of the sensor as a unit vector in IMU axes."""
     axes = settings.body_velocity.axes_body
     return (axes[i, 0], axes[i, 1], axes[i, 2])
 
 
 @njit
 def predict(state, settings):
-    """Return the velocity (m/s) that the sensor should show along its three axes."""
+    """Return the velocity (m/s) that the sensor should measure along its three axes."""
     rotation = to_matrix(state.attitude)
     velocity = point_velocity(state, rotation, body_rate(state, rotation), settings.body_velocity.arm_body)
     return (
@@ -108,7 +108,7 @@ class BodyVelocity(Aid):
 
 
 SETTINGS = np.dtype([("arm_body", "f8", (3,)), ("axes_body", "f8", (3, 3))], align=True)
-"""Where the sensor measures (m from the IMU, in its axes), and the axes of its velocity as rows (IMU axes)."""
+"""Lever arm of the sensor (m, IMU axes), and the axes of its velocity as rows (IMU axes)."""
 
 TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
 BARE_TWIST = "geometry_msgs/msg/TwistStamped"
@@ -116,12 +116,12 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 
 
 def read(messages: npt.NDArray[Any]) -> Readings:
-    """Velocity (m/s) in the axes of the sensor."""
+    """Return velocities (m/s, axes of the sensor) with their covariances."""
     return messages["linear_velocity"], linear_covariances(messages)
 
 
 def limits(body: BodyVelocity) -> dict[str, Any]:
-    """Particulars of the `Intake`."""
+    """Return the fields of the `Intake` that the parameters of this measurement determine."""
     return {
         "std_floor": threefold(body.std_floor),
         "unknown_std": threefold(body.unknown_std),
@@ -131,7 +131,7 @@ def limits(body: BodyVelocity) -> dict[str, Any]:
 
 
 def describe(settings: np.void, parameters: Any) -> None:
-    """Fill in `SETTINGS`."""
+    """Fill `SETTINGS` from the parameters."""
     body: BodyVelocity = parameters.body_velocity
     settings["arm_body"] = arm_body(body.mount_position, parameters)
     settings["axes_body"] = to_base(body.mount_rpy_deg).T @ to_base(parameters.imu.mount_rpy_deg)

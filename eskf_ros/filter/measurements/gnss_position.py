@@ -3,8 +3,8 @@
 Payload: latitude, longitude (rad), ellipsoidal altitude (m), covariance in East-North-Up at the fix (m2: ee, en, eu,
 nn, nu, uu). Groves, section 14.3.1, for the local frame and a map-side attitude error.
 
-A share of the variance may belong to an error that lasts: per axis it is the standard deviation of the fix times the
-root of the share times an optional state of unit variance (first-order Gauss-Markov).
+A share of the variance may belong to a correlated error: per axis it is the standard deviation of the fix, times the
+root of the share, times an augmented state of unit variance (first-order Gauss-Markov).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from eskf_ros.geodesy.rotation import rotate, rotate_back, to_matrix
 SIZE = 3
 
 NOTABLE_SCATTER = 2.0
-"""Fixes whose scatter has more than so many times the variance they claim are not believed it."""
+"""Ratio of the scatter of fixes to the variance they claim above which their noise is inflated."""
 
 
 @njit
@@ -47,13 +47,13 @@ def predict(state, source, settings):
 
 @njit
 def noise_factor(state, source):
-    """Return the factor on the covariances of a receiver's fixes that their scatter asks for (see ``recovery``)."""
+    """Return the factor on the covariances of a receiver's fixes that their scatter demands (see `fix_tracker`)."""
     return state.tracker.scatter[source] if state.tracker.scatter[source] > NOTABLE_SCATTER else 1.0
 
 
 @njit
 def add_lasting_error(state, settings, work):
-    """Give the share of the noise that lasts to its optional states, if they are in use."""
+    """Move the correlated share of the noise to its augmented states, if they are active."""
     place = settings.position_error_at
     if place >= state.error_size:
         return
@@ -92,7 +92,7 @@ def linearize(state, payload, source, settings, work):
 
 
 def limits(gnss: Any) -> dict[str, Any]:
-    """Particulars of the `Intake`; the stand-in for an unknown covariance depends on the status of the fix."""
+    """Return the fields of the `Intake`; the stand-in for an unknown covariance depends on the status of the fix."""
     return {
         "is_used": gnss.use_position,
         "std_floor": threefold(gnss.position_std_floor),
@@ -102,7 +102,7 @@ def limits(gnss: Any) -> dict[str, Any]:
 
 
 def augmented(parameters: Any) -> tuple[OptionalBlock, ...]:
-    """The part of the error of fixes, or of ranges in mode tight, that lasts."""
+    """Return the correlated error of the fixes or, in mode tight, of the ranges."""
     time = parameters.ranges.correlation_time if parameters.mode == "tight" else parameters.gnss.correlation_time
     return (
         OptionalBlock(

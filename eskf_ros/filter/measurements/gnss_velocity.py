@@ -73,12 +73,12 @@ def linearize(state, payload, source, settings, work):
 
 
 def read(messages: npt.NDArray[Any]) -> Readings:
-    """Velocity (m/s) of the antenna, East-North-Up."""
+    """Return velocities (m/s) of the antenna, East-North-Up, with their covariances."""
     return messages["linear_velocity"], linear_covariances(messages)
 
 
 def limits(gnss: Any) -> dict[str, Any]:
-    """Particulars of the `Intake`."""
+    """Return the fields of the `Intake` that the parameters of this measurement determine."""
     return {
         "is_used": gnss.use_velocity,
         "std_floor": threefold(gnss.velocity_std_floor),

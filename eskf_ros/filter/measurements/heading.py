@@ -1,14 +1,14 @@
 """Heading of a line that is fixed to the body: the baseline of a dual-antenna receiver.
 
-Payload: yaw of the line (rad, counter-clockwise from east) and its pitch (rad, positive down, REP-103), both at the
-place where it is, and their covariance (rad2) in the first two axes; either may be absent. With d the line in local
-East-North-Up, yaw = atan2(d_n, d_e) and pitch = atan2(-d_u, |d_e, d_n|); a small rotation theta about local axes adds
-theta x d to d.
+Payload: yaw of the line (rad, counter-clockwise from east) and its pitch (rad, positive down, REP-103), both in local
+axes at the present position, and their covariance (rad2) in the first two axes; either may be absent. With d the line
+in local East-North-Up, yaw = atan2(d_n, d_e) and pitch = atan2(-d_u, |d_e, d_n|); a small rotation theta about local
+axes adds theta x d to d.
 
-What all yaws are wrong by alike, mounting and slow multipath, is an optional state: measured = yaw + offset.
+The common error of all yaws, from mounting and slow multipath, is an augmented state: measured = yaw + offset.
 
-The line of source 1 is the x axis of base_link: what an IMU with a filter of its own says of it, perhaps from magnetic
-north. It serves at start only (``heading_hints``).
+The line of source 1 is the x axis of base_link: the orientation of an IMU with its own filter, perhaps from magnetic
+north. It serves for the initial heading only (`heading_sensors`).
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ from eskf_ros.geodesy.rotation import wrapped
 from eskf_ros.parameters.schema import Aid, parameter
 
 IMU_ORIENTATION = 1
+"""Source of the orientation of an IMU with its own filter; 0 is the dual antenna."""
 
 STEEPEST = 0.17
 """Cosine of the steepest pitch (80 degrees) at which a line still has a heading."""
@@ -54,7 +55,7 @@ def predict(state, source, settings):
 
 @njit
 def linearize(state, payload, source, settings, work):
-    """Write innovation, Jacobian and noise of what was measured of yaw and pitch to ``work``; return the size."""
+    """Write innovation, Jacobian and noise of the measured ones of yaw and pitch to ``work``; return the size."""
     clear(work)
     yaw = payload[0]
     if source == IMU_ORIENTATION and settings.heading.is_orientation_magnetic == 1:
@@ -128,17 +129,21 @@ class Heading(Aid):
 
 SETTINGS = np.dtype([("lines_body", "f8", (SOURCES, 3)), ("is_orientation_magnetic", "i8")], align=True)
 """Baseline of the dual antenna and x axis of base_link (unit vectors, IMU axes); whether the IMU's own orientation
-counts from magnetic north."""
+refers to magnetic north.
+"""
 
 LARGEST_ANGLE = 2.0 * math.pi
 """rad; no driver reports a larger yaw or pitch."""
 
 UNKNOWN_ANGLE_VARIANCE = 1.0
-"""rad2; drivers say with a variance like 1000 or pi^2 that they do not know an angle."""
+"""rad2; a larger variance, such as 1000 or pi^2, means that the driver does not know the angle."""
 
 
 def read(messages: npt.NDArray[Any]) -> Readings:
-    """Yaw (0 = east, counter-clockwise) and pitch (down is positive) of an orientation, if there is one (REP-145)."""
+    """Return yaw (0 = east, counter-clockwise) and pitch (positive down) of orientations, in rad, with their variances.
+
+    A missing orientation (REP-145) leaves all axes absent; one that is no unit quaternion becomes NaN.
+    """
     x, y, z, w = messages["orientation"].T
     values, covariances = np.zeros((len(messages), 3)), np.zeros((len(messages), 9))
     values[:, 0] = np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
@@ -146,7 +151,7 @@ def read(messages: npt.NDArray[Any]) -> Readings:
     given = messages["orientation_covariance"]
     covariances[:, 0], covariances[:, 4] = given[:, 8], given[:, 4]
     covariances[given.any(axis=1), 8] = UNMEASURED
-    # Drivers that know the yaw only leave the pitch zero, and its variance.
+    # Drivers that measure the yaw only leave the pitch and its variance zero.
     covariances[(given[:, 8] > 0.0) & (given[:, 4] == 0.0), 4] = UNMEASURED
     covariances[given[:, 0] == UNMEASURED] = UNMEASURED
     values[np.abs(x * x + y * y + z * z + w * w - 1.0) > 0.1] = math.nan
@@ -154,10 +159,10 @@ def read(messages: npt.NDArray[Any]) -> Readings:
 
 
 def limits(heading: Heading) -> dict[str, Any]:
-    """Particulars of the `Intake`: angles in rad."""
+    """Return the fields of the `Intake`, angles in rad."""
     return {
         "std_floor": threefold(math.radians(heading.std_floor_deg)),
-        # A message without a covariance says nothing of the pitch.
+        # The stand-in of the pitch is NaN: without a covariance the pitch is not used.
         "unknown_std": (math.radians(heading.unknown_std_deg), math.nan, math.nan),
         "largest": LARGEST_ANGLE,
         "may_lack_axes": True,
@@ -166,14 +171,14 @@ def limits(heading: Heading) -> dict[str, Any]:
 
 
 def describe(settings: np.void, parameters: Any) -> None:
-    """Fill in `SETTINGS`."""
+    """Fill `SETTINGS` from the parameters."""
     baseline = to_base(parameters.heading.mount_rpy_deg)[:, 0]
     settings["lines_body"] = np.array([baseline, (1.0, 0.0, 0.0)]) @ to_base(parameters.imu.mount_rpy_deg)
     settings["is_orientation_magnetic"] = parameters.alignment.imu_orientation == "magnetic_north"
 
 
 def augmented(parameters: Any) -> tuple[OptionalBlock, ...]:
-    """The constant by which the antennas point otherwise than their mounting angle says."""
+    """Return the constant difference between the true direction of the baseline and its mounting angle."""
     heading: Heading = parameters.heading
     return (
         OptionalBlock(

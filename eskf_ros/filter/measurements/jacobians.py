@@ -1,4 +1,4 @@
-"""What several aids need to fill in a measurement."""
+"""Parts of innovation, Jacobian and noise that several measurements share."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix
 
 @njit
 def clear(work):
-    """Zero Jacobian and noise, and what the noise shares with the errors."""
+    """Zero Jacobian, noise, and the covariance of noise and errors (``work.shared``)."""
     for i in range(3):
         for j in range(ERROR_CAPACITY):
             work.jacobian[i, j] = 0.0
@@ -23,14 +23,14 @@ def clear(work):
 
 @njit
 def set_identity(jacobian, column):
-    """Write a 3x3 identity block."""
+    """Write a 3x3 identity block from ``column`` on."""
     for i in range(3):
         jacobian[i, column + i] = 1.0
 
 
 @njit
 def set_minus_cross(jacobian, column, v):
-    """Write -[v]x: how a small rotation theta changes v, since theta x v = -[v]x theta."""
+    """Write -[v]x from ``column`` on: how a small rotation theta changes v, since theta x v = -[v]x theta."""
     jacobian[0, column + 1] = v[2]
     jacobian[0, column + 2] = -v[1]
     jacobian[1, column] = -v[2]
@@ -72,8 +72,8 @@ def point_velocity(state, rotation, rate, arm):
 def set_point_velocity_row(jacobian, row, axis, scale, state, rotation, arm):
     """Write how ``scale`` times the velocity of a point along ``axis`` (unit vector, IMU axes) changes with the errors.
 
-    By velocity, by the attitude (which turns the velocity, and the Earth rate that is taken off the gyro), and by the
-    gyro bias through the lever arm.
+    ``arm`` (m, IMU axes) is the lever arm of the point. The row has the velocity, the attitude (which turns the
+    velocity, and the Earth rate that is subtracted from the gyro reading), and the gyro bias through the lever arm.
     """
     axis_map = rotate(rotation, axis)
     lever = cross(axis, arm)
@@ -87,7 +87,7 @@ def set_point_velocity_row(jacobian, row, axis, scale, state, rotation, arm):
 
 @njit
 def mounting_of(state, settings):
-    """Return yaw and pitch (rad) of the axes of the vehicle in base_link: it rolls along its own x axis."""
+    """Return yaw and pitch (rad) of the vehicle's axes in base_link; zero if they are not estimated."""
     place = settings.mounting_at
     if place >= state.error_size:
         return 0.0, 0.0
@@ -108,7 +108,7 @@ def vehicle_axes(state, settings):
 
 @njit
 def set_mounting(jacobian, row, yaw_part, pitch_part, state, settings):
-    """Write how a measurement changes with yaw and pitch of the vehicle's axes, if they are estimated."""
+    """Write the derivatives of a measurement by yaw and pitch of the vehicle's axes, if they are estimated."""
     place = settings.mounting_at
     if place < state.error_size:
         jacobian[row, place] = yaw_part
@@ -123,7 +123,7 @@ def gyro_noise_variance(state, settings):
 
 @njit
 def horizontal_acceleration(state, rotation, force):
-    """Return the size (m/s2) of the horizontal acceleration behind a raw specific force (m/s2, IMU axes)."""
+    """Return the size (m/s2) of the horizontal acceleration for a raw specific force (m/s2, IMU axes)."""
     b = state.accel_bias
     felt = rotate(rotation, (force[0] - b[0], force[1] - b[1], force[2] - b[2]))
     g = gravity_map(state, (state.position_map[0], state.position_map[1], state.position_map[2]))
@@ -134,14 +134,14 @@ def horizontal_acceleration(state, rotation, force):
 
 @njit
 def to_local(state, local_to_ecef, direction_body):
-    """Return a direction of the body in the axes whose rotation to ECEF is given (East-North-Up at its place)."""
+    """Return a direction of the body in the local axes (East-North-Up) whose rotation to ECEF is given."""
     direction_map = rotate(to_matrix(state.attitude), direction_body)
     return rotate_back(local_to_ecef, rotate(state.frame.map_to_ecef, direction_map))
 
 
 @njit
 def set_attitude_row(jacobian, row, state, local_to_ecef, local):
-    """Write how a small rotation about the local axes (``local``) changes a scalar, in map axes."""
+    """Write the derivative of a scalar by the attitude, given as ``local`` by small rotations about the local axes."""
     in_map = rotate_back(state.frame.map_to_ecef, rotate(local_to_ecef, local))
     for i in range(3):
         jacobian[row, ATTITUDE + i] = in_map[i]
@@ -149,9 +149,10 @@ def set_attitude_row(jacobian, row, state, local_to_ecef, local):
 
 @njit
 def azimuth_change(direction, level_square):
-    """Return how a small rotation about local axes changes the angle of ``direction`` from east in the level plane.
+    """Return the derivative of the angle of ``direction`` from east by small rotations about the local axes.
 
-    theta x d has the angle (d_e (theta x d)_n - d_n (theta x d)_e) / (d_e^2 + d_n^2), the latter is ``level_square``.
+    theta x d has the angle (d_e (theta x d)_n - d_n (theta x d)_e) / (d_e^2 + d_n^2); the denominator is
+    ``level_square``.
     """
     slope = -direction[2] / level_square
     return (slope * direction[0], slope * direction[1], 1.0)

@@ -1,4 +1,4 @@
-"""The one measurement update every aid goes through: gate, gain, Joseph, inject, reset."""
+"""The one update of all measurements: innovation gate, gain, Joseph form, injection, reset."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from eskf_ros.geodesy.rotation import from_rotation_vector, left_jacobian, multi
 def update(state, size, gate, work):
     """Fuse ``size`` scalars described by ``work.jacobian``, ``work.innovation``, ``work.noise``, ``work.shared``.
 
-    Returns the verdict and the normalised innovation squared; the state changes only when the verdict is fused.
-    ``gate`` is the largest normalised innovation squared that is accepted. Joseph form with the full product
-    (I - K H) P (I - K H)' + K R K' (Groves, eq. 3.58), evaluated through its rank-``size`` parts, and extended by the
-    covariance C of noise and errors (Brown and Hwang, Introduction to Random Signals, section 5.5). The inverse of the
-    innovation covariance stays in ``work.innovation_covariance``.
+    Returns the verdict and the normalised innovation squared (NIS); the state changes only if the verdict is FUSED.
+    ``gate`` is the largest NIS that is accepted. Joseph form with the full product (I - K H) P (I - K H)' + K R K'
+    (Groves, eq. 3.58), evaluated through its rank-``size`` parts, and extended by the covariance C of noise and errors
+    (Brown and Hwang, Introduction to Random Signals, section 5.5). ``work.innovation_covariance`` contains the inverse
+    of the innovation covariance afterwards.
     """
     project(state, size, work)
     if not invert_positive(work.innovation_covariance, size):
@@ -129,7 +129,7 @@ def update_covariance(state, size, work):
 
 @njit
 def update_nominal_state(state, correction):
-    """Move the error estimate into the nominal state (closed loop); the error state is zero afterwards."""
+    """Inject the error estimate into the nominal state (closed loop); the error state is zero afterwards."""
     for i in range(3):
         state.position_map[i] += correction[POSITION + i]
         state.velocity_map[i] += correction[VELOCITY + i]

@@ -1,15 +1,15 @@
 """Magnetometer: the heading, and nothing else, from the direction of the field in the level plane.
 
 Payload: field in the axes of the sensor (T) and its covariance (T2). The field b of the Earth, freed of the hard iron
-and turned to local East-North-Up with the estimated attitude, should point to magnetic north, at the angle
-pi/2 - declination from east. Its angle atan2(b_n, b_e) is wrong by the yaw error, by the tilt error times the tangent
-of the inclination, by the white noise, and by what iron and currents do.
+and turned to local East-North-Up with the estimated attitude, should point to magnetic north, at the angle pi/2 -
+declination from east. Its angle atan2(b_n, b_e) contains the yaw error, the tilt error times the tangent of the
+inclination, white noise, and disturbances by iron and currents.
 
-Of the latter, what is fixed to the body is the hard iron, an optional state (T, axes of the sensor). The rest is an
-optional state (rad) whose deviation never shrinks with time alone, since a parked robot measures the same wrong field
-again and again: it is a first-order Gauss-Markov process in the angle turned and the distance travelled. A field whose
-strength or inclination cannot be the Earth's is disturbed and not used at all. Strength and inclination do not correct
-the estimate: they would tell tilt, which the accelerometers know better.
+Disturbances fixed to the body are the hard iron, an augmented state (T, axes of the sensor). The others are an
+augmented state (rad) whose deviation never shrinks with time alone, because a parked robot measures the same wrong
+field again and again: a first-order Gauss-Markov process in the angle turned and the distance travelled. A field whose
+strength or inclination cannot be the Earth's is disturbed and is not used. Strength and inclination do not correct the
+estimate: they would observe the tilt, which the accelerometers observe better.
 """
 
 from __future__ import annotations
@@ -51,27 +51,30 @@ EARTH_FIELD = np.dtype(
     ],
     align=True,
 )
-"""The Earth's magnetic field where the last good fix was (rad, rad, T; strength 0: unknown), whether it is known, when
-it
-was last found disturbed; heading (rad) and position (m) since which its error is another.
+"""The Earth's magnetic field at the last good fix, and the error of its direction.
+
+``declination``, ``inclination`` (rad), ``strength`` (T; 0: unknown), valid once ``field_known``. ``disturbed_stamp``:
+when the field was last disturbed (ns). ``heading``, ``position``: heading (rad) and position (m) at the last change of
+the error.
 """
 
 WEAKEST_LEVEL = 2.0e-6
-"""Near the magnetic poles the level part of the field (T) tells no heading."""
+"""T; a weaker field in the level plane, as near the magnetic poles, gives no heading."""
 
 TURN = 1.0
-"""After turning by so much (rad) another error is measured."""
+"""rad; angle over which the error of the field decorrelates (e-folding)."""
 
 STEP = 0.2
-"""The least way that counts (1 is as far as the error lasts)."""
+"""Least way, in units of the correlation length, after which the error of the field is propagated."""
 
 FIELD = 12
-"""In the payload of a fix: whether the Earth's field is known there, declination, inclination (rad), strength (T)."""
+"""Index in the payload of a fix: whether the Earth's field is known, declination, inclination (rad), strength (T)."""
 
 HOLD = 1_000_000_000
-"""A field that was disturbed is not used for so long (ns): at its edges a disturbance looks like the Earth's field."""
+"""ns; after a disturbed field none is used for this long: at its edges a disturbance looks like the Earth's field."""
 
 SIGMAS = 3.0
+"""Standard deviations of the hard iron that widen the tolerances of a disturbed field."""
 
 
 @njit
@@ -87,7 +90,7 @@ def earth_field_body(state, payload, settings):
 
 @njit
 def predict(state, payload, settings):
-    """Return the angle (rad) from east of the measured field in the level plane, freed of the errors that are known."""
+    """Return the angle (rad) from east of the measured field in the level plane, minus its estimated error."""
     b = to_local(state, local_east_north_up_to_ecef(state), earth_field_body(state, payload, settings))
     return math.atan2(b[1], b[0]) - state.optional[settings.mag_error_at - ERROR_SIZE]
 
@@ -103,7 +106,8 @@ def linearize(state, payload, settings, work):
         return 0
     expected = 0.5 * math.pi - state.mag.declination
     work.innovation[0] = wrapped(expected - predict(state, payload, settings))
-    # Not at the measured direction: its noise, which is in the innovation too, would drag along tilt and hard iron.
+    # Linearized at the expected direction. The measured one has the noise of the innovation, which would then enter
+    # tilt and hard iron as well.
     angle = expected + state.optional[settings.mag_error_at - ERROR_SIZE]
     level = math.sqrt(level_square)
     east, north, slope = math.cos(angle), math.sin(angle), -b[2] / level
@@ -128,9 +132,9 @@ def linearize(state, payload, settings, work):
 
 @njit
 def update_disturbance(state, aid, settings):
-    """Say whether strength or inclination of the field are, or were a moment ago, other than the Earth's here.
+    """Say whether the field is, or was within `HOLD`, other than the Earth's in strength or inclination.
 
-    What they are is kept for the monitor.
+    Strength and inclination are kept for the heading monitor.
     """
     if state.mag.strength <= 0.0:
         return False
@@ -155,11 +159,11 @@ def update_disturbance(state, aid, settings):
 
 @njit
 def propagate_mag_error(state, heading, settings):
-    """Let the error of the field change with what was turned and travelled.
+    """Propagate the error of the field over the way, turned and travelled, since the last step; ``heading`` in rad.
 
-    ``heading`` (rad). The error fades by exp(-way) and is driven so that its variance stays as it was at first (Gelb,
-    Applied Optimal Estimation, section 3.8, with the way in place of the time). In steps, so that a parked robot, whose
-    estimate trembles, makes no way.
+    The error decays by exp(-way) and is driven so that its variance stays the initial one (Gelb, Applied Optimal
+    Estimation, section 3.8, with the way in place of the time). Ways shorter than `STEP` wait, so that a parked robot,
+    whose estimate trembles, makes no way.
     """
     i = settings.mag_error_at
     p, last = state.position_map, state.mag.position
@@ -181,7 +185,7 @@ def propagate_mag_error(state, heading, settings):
 
 @njit
 def note_field(state, aid, place):
-    """Remember the Earth's field at a good fix or range, which carries it from ``place`` of its payload on."""
+    """Take the Earth's field from a fused fix or range, which carries it from index ``place`` of its payload on."""
     if aid.verdict == Verdict.FUSED and aid.payload[place] > 0.0:
         state.mag.declination = aid.payload[place + 1]
         state.mag.inclination = aid.payload[place + 2]
@@ -270,20 +274,22 @@ SETTINGS = np.dtype(
     ],
     align=True,
 )
-"""Rotation from the axes of the magnetometer to those of the IMU; share of the strength and angle (rad) by which a
-field may differ from the Earth's; way (m) after which its error is another."""
+"""``sensor_to_imu``: rotation from the axes of the magnetometer to those of the IMU. ``strength_tolerance``,
+``inclination_tolerance``: share of the strength and angle (rad) by which a field may differ from the Earth's.
+``error_distance``: distance (m) over which the error of the field decorrelates.
+"""
 
 STRONGEST_FIELD = 1.0
 """T; no magnetometer on a robot reports more."""
 
 
 def read(messages: npt.NDArray[Any]) -> Readings:
-    """Field (T) in the axes of the magnetometer."""
+    """Return fields (T, axes of the magnetometer) with their covariances."""
     return messages["magnetic_field"], messages["magnetic_field_covariance"]
 
 
 def limits(mag: Mag) -> dict[str, Any]:
-    """Particulars of the `Intake`."""
+    """Return the fields of the `Intake` that the parameters of this measurement determine."""
     return {
         "std_floor": threefold(mag.std_floor),
         "unknown_std": threefold(mag.unknown_std),
@@ -292,7 +298,7 @@ def limits(mag: Mag) -> dict[str, Any]:
 
 
 def describe(settings: np.void, parameters: Any) -> None:
-    """Fill in `SETTINGS`."""
+    """Fill `SETTINGS` from the parameters."""
     mag: Mag = parameters.mag
     imu_to_base = to_base(parameters.imu.mount_rpy_deg)
     mag_to_base = to_base(mag.mount_rpy_deg) if mag.mount_rpy_deg else imu_to_base
@@ -303,9 +309,9 @@ def describe(settings: np.void, parameters: Any) -> None:
 
 
 def augmented(parameters: Any) -> tuple[OptionalBlock, ...]:
-    """Disturbances on the way, and the field of the vehicle itself.
+    """Return the error of the field by disturbances on the way, and the hard iron of the vehicle.
 
-    Not by whether the sensor is used, which may change while running: places stay.
+    The former is there whether or not the sensor is used, because use may change while running and indices may not.
     """
     mag, estimate = parameters.mag, parameters.estimate
     return (

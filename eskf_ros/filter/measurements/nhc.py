@@ -1,15 +1,15 @@
-"""Non-holonomic constraint: a vehicle on wheels moves neither sideways nor up and down where it does not steer.
+"""Non-holonomic constraint: a wheeled vehicle moves neither sideways nor up and down where it does not steer.
 
-Lateral and vertical velocity of the point ``nhc.position`` (the rear axle) in the axes of the vehicle are zero:
-left . (R' v + omega x arm) = 0, and the same with up (Dissanayake et al., The aiding of a low-cost strapdown inertial
+Lateral and vertical velocity of the point ``nhc.position`` (the rear axle) in the axes of the vehicle are zero: left .
+(R' v + omega x arm) = 0, and the same with up (Dissanayake et al., The aiding of a low-cost strapdown inertial
 measurement unit using vehicle model constraints, 2001). No payload; the timeline puts it on its grid.
 
-How far that is from true: tyres slip sideways by an angle that grows with the acceleration, springs let the body pitch
-and roll with it, and even straight ahead the direction of travel differs a little from the vehicle's axes (side wind,
-camber). So the noise has a constant part and an angle times the speed, and the angle grows with the acceleration. These
-errors last for seconds, longer than the grid is wide. The default angles are therefore about twice what cars show:
-an error that lasts for 2 s and comes with every one of the constraints does as much harm as one of twice the size that
-is new every second.
+The constraint holds only approximately: tyres slip sideways by an angle that grows with the acceleration, springs let
+the body pitch and roll with it, and even straight ahead the direction of travel differs a little from the vehicle's
+axes (side wind, camber). The noise therefore has a constant part, and an angle times the speed that grows with the
+acceleration. These errors last for seconds, longer than the spacing of the grid. The default angles are therefore about
+twice what cars show: an error that lasts for 2 s and is in every constraint does as much harm as an independent error
+of twice the size every second.
 """
 
 from __future__ import annotations
@@ -44,16 +44,19 @@ from eskf_ros.parameters.schema import parameter
 SIZE = 2
 
 CERTAIN_HEADING = 0.17
-"""With a heading less certain than this (rad) the direction of travel says nothing yet."""
+"""rad; standard deviation of the heading above which the constraint is not applied: the direction of travel is unknown.
+"""
 
 SLIP_MEMORY = 1_500_000_000
+"""ns; time after a wheel message outside the gate during which the wheels are assumed to slip."""
+
 SLIPPING = 5.0
-"""For so long (ns) after a message of the wheels outside the gate all deviations are taken so much larger."""
+"""Factor on the standard deviations of the constraint while the wheels are assumed to slip."""
 
 
 @njit
 def predict(state, settings):
-    """Return the lateral and the vertical velocity (m/s) of the point."""
+    """Return the lateral and the vertical velocity (m/s) of the constrained point."""
     rotation = to_matrix(state.attitude)
     _forward, left, up = vehicle_axes(state, settings)
     velocity = point_velocity(state, rotation, body_rate(state, rotation), settings.nhc.arm_body)
@@ -68,7 +71,7 @@ def heading_variance(state):
 
 @njit
 def linearize(state, settings, work):
-    """Write innovation, Jacobian and noise to ``work``; return the number of scalars, 0 when it does not hold."""
+    """Write innovation, Jacobian and noise to ``work``; return the number of scalars, 0 if it is not applied."""
     if not has_block(state) or heading_variance(state) > CERTAIN_HEADING**2:
         return 0
     clear(work)
@@ -166,11 +169,11 @@ SETTINGS = np.dtype(
     ],
     align=True,
 )
-"""The point that does not slide (m from the IMU, in its axes), and how true the constraint is: see `Nhc`."""
+"""Lever arm of the constrained point (m, IMU axes), and the noise of the constraint: see `Nhc`."""
 
 
 def describe(settings: np.void, parameters: Any) -> None:
-    """Fill in `SETTINGS`."""
+    """Fill `SETTINGS` from the parameters."""
     nhc: Nhc = parameters.nhc
     settings["arm_body"] = arm_body(nhc.position, parameters)
     settings["lateral_std"] = nhc.lateral_std

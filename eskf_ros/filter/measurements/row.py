@@ -1,8 +1,8 @@
-"""One row of facts for each measurement: what the rest of the package has to know of it.
+"""One row of facts for each measurement: all that the rest of the package has to know of it.
 
 The row stands in the file of the measurement, beside its equations. Settings, inputs, parameters, extrinsics,
-diagnostics and the documentation read it; `fuse.MEASUREMENTS` lists the rows. `docs/add_a_measurement.md` shows how a
-new one is written.
+diagnostics and the documentation read it; `fuse.MEASUREMENTS` lists the rows. `docs/add_a_measurement.md` shows how to
+write a new one.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ UNMEASURED = -1.0
 """The variance of an axis that was not measured (REP-145 writes it for a quantity that is not there)."""
 
 NEEDS_LEVEL, NEEDS_POSITION, NEEDS_HEADING, NEEDS_FIELD = 0, 1, 2, 4
-"""What has to be known, besides the level, before a measurement can be fused; sums say more than one."""
+"""What must be known, besides the level, before a measurement can be fused. A sum of them means all of them."""
 
 NOTHING = np.dtype([])
-"""The settings of a measurement that has none of its own."""
+"""Settings of a measurement that has none of its own."""
 
 
 @dataclass(frozen=True)
 class Intake:
-    """How the messages of a stream are taken in.
+    """How the messages of a stream are checked and conditioned before they enter the timeline.
 
-    ``std_floor`` and ``unknown_std`` per axis, in the unit of the values; the latter stands in for a covariance that is
-    not there. No message with a value beyond ``largest`` can be true. ``may_lack_axes``: a negative variance, or one
-    above ``largest_variance``, says that the axis was not measured. The first value is never below ``lowest``.
+    ``std_floor`` and ``unknown_std`` are per axis, in the unit of the values; ``unknown_std`` stands in for a missing
+    covariance. A message with a value beyond ``largest``, or with a first value below ``lowest``, is refused.
+    ``may_lack_axes``: a negative variance, or one above ``largest_variance``, says that the axis was not measured.
     """
 
     is_used: bool
@@ -60,7 +60,7 @@ class Intake:
 class OptionalBlock(NamedTuple):
     """Augmented states of one kind (`OPTIONAL_SIZES`).
 
-    ``std``: at first; ``correlation_time`` in s, 0 for a random walk; ``streams``: those that need the states.
+    ``std``: the initial one; ``correlation_time`` in s, 0 for a random walk; ``streams``: those that need the states.
     """
 
     name: str
@@ -73,7 +73,11 @@ class OptionalBlock(NamedTuple):
 
 @dataclass(frozen=True)
 class Place:
-    """Where a sensor sits: parameters of its position and orientation (empty: of no account), inputs that name it."""
+    """Where a sensor sits.
+
+    ``position``, ``rotation``: names of the parameters; empty if the measurement does not depend on it. ``inputs``: the
+    inputs whose messages name the frame of the sensor.
+    """
 
     position: str = ""
     rotation: str = ""
@@ -81,7 +85,7 @@ class Place:
 
 
 def nothing(*_: Any) -> tuple[OptionalBlock, ...]:
-    """No augmented states, no settings."""
+    """Return nothing: no augmented states, no settings."""
     return ()
 
 
@@ -93,17 +97,18 @@ class Row:
     documentation. ``group_name`` is the name of the group; empty: that of the stream in lower case.
 
     For a measurement that a sensor sends: ``types`` are the message types (the usual one first), ``topic`` the default
-    of the parameter ``topics.NAME`` and ``topic_about`` its description; ``read`` makes values and covariances of a
-    structured array of messages; ``limits`` makes the particulars of the `Intake` of a group of parameters; ``depth``:
-    messages that may wait in the node while the computer is busy elsewhere; ``is_gnss``: withheld in an outage.
+    of the parameter ``topics.NAME`` and ``topic_about`` its description; ``read`` turns a structured array of messages
+    into values and covariances; ``limits`` turns a group of parameters into fields of the `Intake`; ``depth``: messages
+    that may wait in the node while the computer is busy elsewhere; ``is_gnss``: withheld in a simulated outage.
 
-    ``needs``: what has to be known before it is fused. ``gate_probability``: instead of the parameter of this name.
-    ``augmented`` makes the augmented states of the parameters. ``place``: where the sensor sits, if that counts.
-    ``settings``: record of what the kernels read as ``settings.NAME``; ``describe`` fills it from the parameters.
-    ``is_enabled``: for a constraint, whether the parameters switch it on.
+    ``needs``: what must be known before it is fused. ``gate_probability``: replaces the parameter of this name.
+    ``augmented`` returns the augmented states that the parameters ask for. ``place``: where the sensor sits, if the
+    measurement depends on it. ``settings``: record of what the kernels read as ``settings.NAME``; ``describe`` fills it
+    from the parameters. ``is_enabled``: for a constraint, whether the parameters switch it on.
 
     For tables in memory (`eskf_ros.run`): ``columns`` of the values, one of which may be left out
-    (``optional_column``); ``is_vector``: one column of three numbers; ``has_one_unit``: one variance may do for all.
+    (``optional_column``); ``is_vector``: one column of three numbers; ``has_one_unit``: one variance may stand for all
+    axes.
     """
 
     stream: Stream
@@ -132,7 +137,7 @@ class Row:
 
     @property
     def name(self) -> str:
-        """Name of the stream, of its topic and of its record in the settings."""
+        """Name of the stream, of its topic, and of its record in the settings."""
         return self.stream.name.lower()
 
     @property
@@ -142,7 +147,10 @@ class Row:
 
     @property
     def is_sent(self) -> bool:
-        """Whether the messages of a sensor bring it. What a GNSS receiver solved has intakes of its own."""
+        """Whether a sensor sends it as values with a covariance.
+
+        The solutions of a GNSS receiver have intakes of their own.
+        """
         return self.read is not None and self.group is not None
 
 
@@ -152,13 +160,13 @@ def threefold(value: float) -> Axes:
 
 
 def to_base(rpy_deg: tuple[float, ...]) -> FloatArray:
-    """Return the rotation matrix (3, 3) to base_link from the axes of a sensor that is mounted like this (deg)."""
+    """Return the rotation matrix (3, 3) to base_link from the axes of a sensor with this mounting (deg)."""
     roll, pitch, yaw = (math.radians(angle) for angle in rpy_deg)
     return np.array(to_matrix(from_roll_pitch_yaw(roll, pitch, yaw)))
 
 
 def arm_body(position_base: tuple[float, ...], parameters: Any) -> FloatArray:
-    """Return a place in base_link (m) as the lever arm (3,) from the IMU in its axes."""
+    """Return the lever arm (3,) (m, IMU axes) from the IMU to a point of base_link (m)."""
     imu = parameters.imu
     arm: FloatArray = np.subtract(position_base, imu.mount_position) @ to_base(imu.mount_rpy_deg)
     return arm
@@ -172,5 +180,5 @@ def twist_covariances(messages: npt.NDArray[Any]) -> FloatArray:
 
 
 def linear_covariances(messages: npt.NDArray[Any]) -> FloatArray:
-    """Return the covariances (n, 9) of the linear velocities of messages."""
+    """Return the covariances (n, 9) of the linear velocities of messages; all zero where their type has none."""
     return twist_covariances(messages)[:, :3, :3].reshape(-1, 9)

@@ -1,14 +1,14 @@
 """Wheel odometry: forward speed of a point of the vehicle, and its yaw rate.
 
-Payload: speed (m/s), yaw rate (rad/s), 0, covariance (ss, sy, 0, yy, 0, absent); what is not measured has the variance
+Payload: speed (m/s), yaw rate (rad/s), 0, covariance (ss, sy, 0, yy, 0, absent); an unmeasured value has the variance
 -1. The speed is that of the point ``wheel.position`` along the x axis of the vehicle, forward . (R' v + omega x arm),
 times one plus the scale error; the yaw rate is that about the vehicle's z axis (Groves, section 16.1.1, with attitude,
 gyro bias, scale and mounting in the Jacobian).
 
-The covariance of the message is that of the noise of each message alone. What lasts is added here: tyres slip by a
-share of the speed that grows with the force on them, and wheels of unequal size turn a straight line into a curve. An
-error that lasts for T s and comes with every message, dt s apart, does as much harm as a new one every time with
-2 T / dt times the variance (the spectral densities of the two at low frequencies are equal).
+The covariance of the message is that of the independent noise of each message. Lasting errors are added here: tyres
+slip by a share of the speed that grows with the force on them, and wheels of unequal size turn a straight line into a
+curve. An error that lasts for T s and is in every message, dt s apart, does as much harm as an independent one with 2 T
+/ dt times the variance (the spectral densities of the two at low frequencies are equal).
 """
 
 from __future__ import annotations
@@ -48,26 +48,27 @@ from eskf_ros.geodesy.rotation import cross, dot, rotate, to_matrix
 from eskf_ros.parameters.schema import Aid, parameter
 
 LASTING_SPEED_ERROR = 0.001
-"""Share of the speed by which it is wrong for a while, even when no force is on the tyres."""
+"""Lasting error of the speed, as a share of it, even without a force on the tyres."""
 
 SLIP_TIME = 1.0
-"""Seconds for which slip lasts."""
+"""s; errors of the speed last for this long."""
 
 LASTING_TURN_ERROR = 0.03
-"""Share of the yaw rate by which it is wrong: the track of tyres that are squeezed and slip."""
+"""Lasting error of the yaw rate, as a share of it: tyres that are squeezed and slip change the effective track."""
 
 UNEQUAL_WHEELS = 7e-4
-"""Yaw rate (rad/s) that wheels of unequal size pretend at 1 m/s: 0.1 % of their radius, 1.5 m apart."""
+"""Yaw rate (rad/s) at 1 m/s by wheels of unequal size: 0.1 % of their radius, 1.5 m apart."""
 
 TURN_ERROR_TIME = 60.0
-"""Seconds for which errors of the yaw rate last: load and tyre pressure."""
+"""s; errors of the yaw rate by load and tyre pressure last for this long."""
 
 SHORTEST_INTERVAL = 0.001
+"""s; least time between two messages that counts."""
 
 
 @njit
 def scale_of(state, settings):
-    """Return what the wheels multiply the speed with."""
+    """Return the ratio of the speed that the wheels report to the true one."""
     place = settings.wheel_scale_at
     if place >= state.error_size:
         return 1.0
@@ -76,7 +77,7 @@ def scale_of(state, settings):
 
 @njit
 def predict(state, settings):
-    """Return the speed (m/s) and the yaw rate (rad/s) that the wheels should show."""
+    """Return the speed (m/s) and the yaw rate (rad/s) that the wheels should measure."""
     rotation = to_matrix(state.attitude)
     rate = body_rate(state, rotation)
     forward, _left, up = vehicle_axes(state, settings)
@@ -86,7 +87,7 @@ def predict(state, settings):
 
 @njit
 def repeated(state, time):
-    """Return the factor on the variance of an error that lasts for ``time`` s and comes with every message."""
+    """Return the factor on the variance of an error that lasts for ``time`` s and is in every message."""
     if state.rest.wheel_stamp == NEVER:
         return 1.0
     interval = max((state.stamp - state.rest.wheel_stamp) * 1e-9, SHORTEST_INTERVAL)
@@ -188,7 +189,7 @@ class Wheel(Aid):
 
 
 SETTINGS = np.dtype([("arm_body", "f8", (3,)), ("slip", "f8")], align=True)
-"""Where the wheels measure (m from the IMU, in its axes); share of the speed by which tyres slip per m/s2."""
+"""Lever arm of the wheel point (m, IMU axes); slip as a share of the speed per m/s2."""
 
 TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
 BARE_TWIST = "geometry_msgs/msg/TwistStamped"
@@ -196,7 +197,7 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 
 
 def read(messages: npt.NDArray[Any]) -> Readings:
-    """Speed along x (m/s) and yaw rate (rad/s) of a twist; the third axis is absent."""
+    """Return speed along x (m/s) and yaw rate (rad/s) of twists with their covariances; the third axis is absent."""
     values, covariances = np.zeros((len(messages), 3)), np.zeros((len(messages), 9))
     values[:, 0] = messages["linear_velocity"][:, 0]
     values[:, 1] = messages["angular_velocity"][:, 2]
@@ -208,7 +209,7 @@ def read(messages: npt.NDArray[Any]) -> Readings:
 
 
 def limits(wheel: Wheel) -> dict[str, Any]:
-    """Particulars of the `Intake`."""
+    """Return the fields of the `Intake` that the parameters of this measurement determine."""
     return {
         "std_floor": (wheel.speed_std_floor, wheel.yaw_rate_std_floor, 1.0),
         "unknown_std": (wheel.unknown_speed_std, wheel.unknown_yaw_rate_std, 1.0),
@@ -218,13 +219,13 @@ def limits(wheel: Wheel) -> dict[str, Any]:
 
 
 def describe(settings: np.void, parameters: Any) -> None:
-    """Fill in `SETTINGS`."""
+    """Fill `SETTINGS` from the parameters."""
     settings["arm_body"] = arm_body(parameters.wheel.position, parameters)
     settings["slip"] = parameters.wheel.slip
 
 
 def augmented(parameters: Any) -> tuple[OptionalBlock, ...]:
-    """Axes of the vehicle in base_link, which the constraint of its wheels needs too, and the scale of the speed."""
+    """Return the mounting of the vehicle's axes in base_link, which the NHC needs, too, and the scale of the speed."""
     estimate = parameters.estimate
     return (
         OptionalBlock(

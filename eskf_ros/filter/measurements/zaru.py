@@ -1,12 +1,12 @@
 """Zero angular rate update: a robot that stands still turns with the Earth, and the rest that its gyro reads is bias.
 
 mean rate = gyro bias + R' Omega + noise, over the time since the last point on the grid of the constraints (Groves,
-section 15.3.2, with the Earth rate and, in the Jacobian, what an attitude error makes of it: a heading that is not
-known leaves the horizontal part of the Earth rate in doubt, and one that is can be sharpened by it).
+section 15.3.2). The Earth rate depends on the attitude, which is therefore in the Jacobian: an unknown heading leaves
+the horizontal part of the Earth rate in doubt, and the measurement can sharpen a known one.
 
-The white noise in the mean is the very noise that has turned the attitude since the last grid point: they are
-correlated, and the update is told so (``work.shared``). Taking the one back takes the other back: the heading stands as
-still as the robot, instead of walking with the noise of the gyro.
+The white noise in the mean has also turned the attitude since the last grid point: noise and attitude error are
+correlated, and the update is told so (``work.shared``). A correction of the noise then corrects the attitude, too, so
+that the heading of a robot at rest does not walk with the noise of the gyro.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from eskf_ros.geodesy.rotation import cross, rotate_back, to_matrix
 SIZE = 3
 
 INTERVAL = CONSTRAINT_INTERVAL * 1e-9
+"""s; time over which the mean rate is taken."""
 
 
 @njit
@@ -37,9 +38,10 @@ def predict(state):
 
 @njit
 def remaining_share(state, density):
-    """Return how much of the noise of the last interval is certainly still in the attitude (0 to 1).
+    """Return the share (0 to 1) of the noise of the last interval that is certainly still in the attitude error.
 
-    Measurements in between may have taken it back. Never so much that attitude and noise have no common covariance.
+    Measurements in between may have removed it. The share is limited, so that attitude error and noise keep a positive
+    definite joint covariance.
     """
     smallest = min(
         state.covariance[ATTITUDE, ATTITUDE],
@@ -51,7 +53,7 @@ def remaining_share(state, density):
 
 @njit
 def linearize(state, settings, work):
-    """Write innovation, Jacobian and noise to ``work``; return the number of scalars, 0 when it does not hold."""
+    """Write innovation, Jacobian and noise to ``work``; return the number of scalars, 0 unless the robot is at rest."""
     if not is_resting(state, settings):
         return 0
     clear(work)

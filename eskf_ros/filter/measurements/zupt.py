@@ -1,8 +1,9 @@
 """Zero velocity update: a robot that stands still has no velocity.
 
-No payload; the timeline puts it on its grid, and ``stillness`` decides when it holds. The velocity of the IMU is zero
-but for what a body sways on its springs (Groves, section 15.3.1). Swaying lasts for less than the grid is wide, so that
-it is new every time; ten zeros in a second would be believed ten times.
+No payload; the timeline puts it on its grid, and the static detector (`stationarity.detector`) decides whether it
+holds. The velocity of the IMU is zero but for the swaying of a body on its springs (Groves, section 15.3.1). Swaying
+lasts for less than the spacing of the grid, so that the errors of the updates are independent; ten updates in a second
+would not be.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ SIZE = 3
 
 @njit
 def linearize(state, settings, work):
-    """Write innovation, Jacobian and noise to ``work``; return the number of scalars, 0 when it does not hold."""
+    """Write innovation, Jacobian and noise to ``work``; return the number of scalars, 0 unless the robot is at rest."""
     if not is_resting(state, settings):
         return 0
     clear(work)
@@ -64,14 +65,14 @@ class Zupt:
 
 
 CONSTRAINT_GATE_PROBABILITY = 0.999
-"""Share of the constraints that passes their chi-square gate where they hold."""
+"""Share of the constraints that passes the chi-square gate if they hold."""
 
 SETTINGS = np.dtype([("velocity_std", "f8"), ("rate_std", "f8")], align=True)
-"""How fast a body sways (m/s) and turns (rad/s) at rest."""
+"""Standard deviations of the velocity (m/s) and of the rate (rad/s) of a body at rest."""
 
 
 def describe(settings: np.void, parameters: Any) -> None:
-    """Fill in `SETTINGS`."""
+    """Fill `SETTINGS` from the parameters."""
     settings["velocity_std"] = parameters.zupt.velocity_std
     settings["rate_std"] = parameters.zupt.rate_std
 

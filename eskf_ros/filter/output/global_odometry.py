@@ -1,4 +1,4 @@
-"""What is published: the state of the IMU turned into pose and twist of base_link, with covariance."""
+"""Output rows: the state of the IMU turned into pose and twist of base_link, with covariance, and the status."""
 
 from __future__ import annotations
 
@@ -40,19 +40,24 @@ ODOMETRY = np.dtype(
 )
 """What is published for one IMU sample: pose and twist of base_link (here "body" is base_link), biases in IMU axes.
 
-``map`` pose: the best estimate. ``odom`` pose: without jumps (see ``local``).
+``map`` pose: the best estimate. ``odom`` pose: without jumps (see `local_odometry`). Units: ns, m, m/s, rad/s, m/s2;
+attitudes are quaternions (w x y z). Covariances: position and rotation in map axes, velocity and rate in base_link
+axes.
 """
 
 SHORTEST_COAST = 1_000_000_000
+"""ns; least time without an accepted position after which the status is COASTING (usually two of its intervals)."""
+
 LONGEST_WAIT = 3_000_000_000
+"""ns; largest time without an accepted position after which the status is COASTING."""
 
 CONTRADICTIONS = 3
-"""So many fixes in a row that were not fused as they came are more than outliers."""
+"""Absolute positions rejected in a row from which on the status is DEGRADED: fewer may be outliers."""
 
 
 @njit
 def status_of(state, settings):
-    """Return the rung of the ladder; coasting is a second without a fix, or twice the usual wait up to three."""
+    """Return the `Status` at the stamp of the state."""
     if state.imu.stamp == NEVER:
         return Status.WAITING_IMU
     if state.level_known == 0:
@@ -108,8 +113,8 @@ def attitude_base_to_map(state, settings):
 def write_odometry(state, local, settings, row):
     """Fill one ODOMETRY row from the state and the local pose.
 
-    The pose error of base_link is that of the IMU plus [R m]x theta, m the IMU's place in base_link; the twist error
-    in base_link axes is R' (dv + v x theta), v the velocity of the IMU (first order; Sola, section 4.4).
+    The pose error of base_link is that of the IMU plus [R m]x theta, m the position of the IMU in base_link; the twist
+    error in base_link axes is R' (dv + v x theta), v the velocity of the IMU (first order; Sola, section 4.4).
     """
     covariance = state.covariance
     base_to_map = attitude_base_to_map(state, settings)
@@ -193,9 +198,9 @@ def write_pose_covariance(covariance, imu_offset, row):
 def write_twist_covariance(state, base_to_map, settings, row):
     """Write the 6x6 covariance of the twist in base_link axes."""
     covariance = state.covariance
-    # The sway of the mounting offset is known in body axes: an attitude error turns only the velocity of the IMU.
+    # The velocity by the lever arm is known in body axes: an attitude error turns only the velocity of the IMU.
     velocity = (state.velocity_map[0], state.velocity_map[1], state.velocity_map[2])
-    # What the rate error times the mounting offset adds to the velocity is left out: millimetres per second.
+    # The rate error times the lever arm is neglected: it adds millimetres per second.
     rate_variance = settings.gyro_noise_density**2 / state.imu.interval
     for i in range(3):
         forward_i = (base_to_map[0][i], base_to_map[1][i], base_to_map[2][i])

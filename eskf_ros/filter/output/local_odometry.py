@@ -1,10 +1,9 @@
-"""Odometry without jumps: the pose of base_link in `odom`, moved only by what the IMU and the velocity say.
+"""Odometry without jumps: the pose of base_link in `odom`, moved by predicted steps only.
 
-Corrections move the map pose; here they are taken out again. From one IMU sample to the next the local pose gains the
-predicted displacement and turn, without the jumps of the measurements in between and without those of a rewind: the
-step is that of the latest estimate, the place it starts from is what was published. Roll and pitch are the filter's.
-It depends on the order of arrival, as only the complaints about messages that were not let in do besides, and it is not
-part of the rewound state.
+Corrections move the pose in map; here they are taken out again. From one IMU sample to the next the local pose gains
+the predicted displacement and turn, without the jumps by measurements in between and by a rewind: the step is that of
+the latest estimate, and it starts from the published pose. Roll and pitch are those of the filter. The local pose
+depends on the order of arrival and is not part of the rewound state.
 """
 
 from __future__ import annotations
@@ -31,8 +30,11 @@ STEP = np.dtype(
     ],
     align=True,
 )
-"""Step over the last IMU interval (m in map, rad), pose at its end, and corrections since: for the odometry without
-jumps.
+"""What the odometry without jumps needs of the state.
+
+``step_position``, ``step_heading``: predicted step over the last IMU interval (m in map, rad). ``sample_position``,
+``sample_heading``: position (m) and heading (rad) at its end. ``jump_position``, ``jump_heading``: corrections since
+then (m, rad).
 """
 
 LOCAL = np.dtype(
@@ -45,15 +47,15 @@ LOCAL = np.dtype(
     ],
     align=True,
 )
-"""Pose of the IMU in `odom` (m, rad) and the variances it has gathered since the start (per axis)."""
+"""Pose of the IMU in `odom` (m, rad), and the variances per axis that it has gathered since the start (m2, rad2)."""
 
 STILL_SPEED = 0.05
-"""Speed (m/s) that a robot at rest may have without anybody noticing."""
+"""m/s; standard deviation of the velocity of a robot at rest before the first fix."""
 
 
 @njit
 def measure_step(state, settings):
-    """Note displacement (m, map) and turn (rad) since the last IMU sample, corrections left out."""
+    """Store the displacement (m, map) and turn (rad) since the last IMU sample, without corrections."""
     heading = heading_of(state, settings)
     for i in range(3):
         state.odom.step_position[i] = (
@@ -68,7 +70,7 @@ def measure_step(state, settings):
 
 @njit
 def note_jump(state, position, heading, settings):
-    """Add how far a correction has moved the state from ``position`` (m) and ``heading`` (rad)."""
+    """Add the correction that has moved the state from ``position`` (m, map) and ``heading`` (rad)."""
     for i in range(3):
         state.odom.jump_position[i] += state.position_map[i] - position[i]
         state.tracker.corrections_map[i] += state.position_map[i] - position[i]
@@ -79,7 +81,8 @@ def note_jump(state, position, heading, settings):
 def carry(local, state, settings):
     """Move the local pose by the step of the newest IMU sample, and let its uncertainty grow.
 
-    Velocity and gyro bias errors last, so they add up linearly; the position also goes astray by the heading's.
+    Errors of velocity and gyro bias are correlated over time, so their standard deviations add up; the error of the
+    heading moves the position, too.
     """
     if local.started == 0:
         local.started = 1

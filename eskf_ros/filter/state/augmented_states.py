@@ -1,10 +1,10 @@
-"""Optional states: scales, mounting, offsets and errors of sensors, estimated with the core when their sensor is there.
+"""Augmented states: scales, mounting, offsets and errors of sensors, estimated if their sensor is there.
 
-Each has a fixed place behind the core (``settings.NAME_at``) and costs nothing until it joins, with the first
-measurement that needs it: from then on ``state.error_size`` reaches over it. Its error is a sum (true = estimate +
-error); value and variance live in ``state.optional`` and ``state.covariance``. By itself it is a random walk, or a
-first-order Gauss-Markov process if it has a correlation time (Gelb, Applied Optimal Estimation, section 3.8). The core
-does not depend on any of them: their columns of the covariance turn with the core's transition and no more.
+Each has a fixed index behind the core (``settings.NAME_at``) and costs nothing until the first measurement that needs
+it activates it: from then on ``state.error_size`` includes it. Its error is additive (true = estimate + error); its
+value is in ``state.optional``, its variance in ``state.covariance``. It is a random walk or, with a correlation time, a
+first-order Gauss-Markov process (Gelb, Applied Optimal Estimation, section 3.8). The core does not depend on any of
+them: the transition matrix of the core acts on their columns of the covariance and does no more.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from eskf_ros.filter.state.error_state import ERROR_SIZE
 
 @njit
 def update_error_size(state, reach, settings):
-    """Take the optional states into use, so that ``reach`` errors are."""
+    """Activate augmented states until ``reach`` errors are in use."""
     if reach > state.error_size:
         reset_augmented(state, state.error_size, reach - state.error_size, settings)
         state.error_size = reach
@@ -23,7 +23,7 @@ def update_error_size(state, reach, settings):
 
 @njit
 def reset_augmented(state, place, count, settings):
-    """Begin again with ``count`` optional states from ``place``: zero, as uncertain as at first, independent."""
+    """Reset ``count`` augmented states from index ``place``: value zero, initial variance, no correlations."""
     covariance = state.covariance
     for i in range(place, place + count):
         state.optional[i - ERROR_SIZE] = 0.0
@@ -35,7 +35,7 @@ def reset_augmented(state, place, count, settings):
 
 @njit
 def propagate_augmented(state, dt, settings):
-    """Let ``dt`` s pass for the optional states: they decay towards zero and become less certain."""
+    """Propagate the augmented states over ``dt`` s: they decay towards zero and gain process noise."""
     covariance = state.covariance
     if settings.clock_at < state.error_size:
         propagate_clock(state, settings.clock_at, dt, settings)
@@ -52,7 +52,7 @@ def propagate_augmented(state, dt, settings):
 
 @njit
 def propagate_clock(state, place, dt, settings):
-    """Let ``dt`` s pass for the receiver's clock: the bias gains what the drift says, and what the drift gains.
+    """Propagate the receiver clock over ``dt`` s: the drift, with its process noise, enters the bias.
 
     Two-state clock (Brown and Hwang, Introduction to Random Signals and Applied Kalman Filtering, section 9.3); the
     white noise of each of its two states is left to `propagate_augmented`.

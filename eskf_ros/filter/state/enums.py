@@ -1,4 +1,4 @@
-"""The words of the estimator: status, phases of a measurement, verdicts and streams."""
+"""Enumerations of the estimator: status, phases of a stream, verdicts and streams."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from enum import IntEnum, auto
 
 
 class Status(IntEnum):
-    """What the estimator has, in the order in which it gets it.
+    """How far the alignment is and how good the estimate is, in the order in which a start reaches them.
 
-    COASTING: no position was accepted for a while. DEGRADED: fixes come and contradict the estimate. FAULT: the
-    estimate is not finite or a variance negative, only a reset helps.
+    COASTING: no position has been accepted for a while (dead reckoning). DEGRADED: fixes come and contradict the
+    estimate. FAULT: the estimate is not finite or a variance is negative; only a reset helps.
     """
 
     WAITING_IMU = 0
@@ -24,10 +24,10 @@ class Status(IntEnum):
 
 
 class Phase(IntEnum):
-    """What an aid is to the filter (see ``recovery``).
+    """Whether the filter uses a stream of measurements at present (see `recovery`).
 
-    SUSPICIOUS: the latest measurements were rejected. OUTAGE: none came for a while. REACQUIRING: they come, but none
-    was accepted for a while, or not for long yet. RESET: a short while ago they won over the filter.
+    SUSPICIOUS: the latest measurements were rejected. OUTAGE: none has come for a while. REACQUIRING: they come, but
+    none has been accepted for a while, or not yet for long. RESET: a short while ago they won over the filter.
     """
 
     WAITING = 0
@@ -41,9 +41,10 @@ class Phase(IntEnum):
 class Verdict(IntEnum):
     """What became of an offered measurement (a closed list; files show the names in lower case).
 
-    INACTIVE is for what says nothing at the moment, such as rest while the robot moves: it leaves no record.
-    CONTRADICTED: a position that moves otherwise than the velocity of the same receiver. RESET: it is the last of so
-    many rejected ones that agree with each other that the filter gave in.
+    GATE: outside the innovation gate. WEIGHED_DOWN: fused with inflated noise. INACTIVE: the measurement says nothing
+    at the moment, such as a ZUPT in motion; it leaves no record. CONTRADICTED: a position that moves otherwise than the
+    velocity of the same receiver. RESET: the last of several rejected measurements that agree with each other; the
+    filter was reset to them.
     """
 
     WAITING = 0
@@ -66,7 +67,7 @@ class Verdict(IntEnum):
 
 
 class Stream(IntEnum):
-    """Streams by rank: of several messages with one stamp the lower rank comes first.
+    """Streams by rank: of several messages with the same stamp the one with the lower rank comes first.
 
     From ZUPT on they are constraints: no sensor sends them, the timeline puts them on a grid of stamps.
     """
@@ -94,8 +95,8 @@ SENSOR_STREAMS = int(min(CONSTRAINTS))
 """Number of the streams that sensors send, the IMU included; they have the lowest ranks."""
 
 CONSTRAINT_INTERVAL = 1_000_000_000
-"""The grid of the constraints (ns).
+"""ns; spacing of the grid of the constraints.
 
-What makes them wrong (side slip, a body that sways) lasts for about half as long at the least: closer together they
-would not be independent of each other, and the filter would believe their mean too much.
+The errors of the constraints (side slip, a body that sways) last for about half of it, at least. At a shorter spacing
+they would be correlated, and the filter would trust their mean too much.
 """

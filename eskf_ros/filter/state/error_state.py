@@ -1,10 +1,14 @@
-"""Indices of the error state: 15 errors that every robot has, and the augmented ones behind them."""
+"""Indices of the error state: 15 core errors that every robot has, and the augmented states behind them.
+
+The core, three errors each: position (m), velocity (m/s) and attitude (rad) in map, accelerometer bias (m/s2) and gyro
+bias (rad/s) in IMU axes.
+"""
 
 from __future__ import annotations
 
 from eskf_ros.gnss.signals import BEIDOU_3, Gnss
 
-# Error state: first index of each block of three. These 15 are the core; every robot has them.
+# First index of each block of three.
 POSITION = 0
 
 VELOCITY = 3
@@ -29,21 +33,23 @@ OPTIONAL_SIZES = {
     "mag_error": 1,
     "magnetic_bias": 3,
 }
-"""Optional errors behind the core, and how many each is: see ``optional``.
+"""Augmented states in the order of their indices, and how many errors each has; see `augmented_states`.
 
-``clock``: of the receiver, bias (m) and drift (m/s). ``inter_system``: by what the ranges of a constellation are longer
-than those of GPS (m), in the order of `INTER_SYSTEM`.
+``clock``: of the receiver, bias (m) and drift (m/s). ``inter_system``: offset of the ranges of a constellation from
+those of GPS (m), in the order of `INTER_SYSTEM`.
 """
 
 INTER_SYSTEM = (Gnss.GALILEO, BEIDOU_3, Gnss.GLONASS, Gnss.QZSS, Gnss.BEIDOU, Gnss.SBAS)
-"""The constellations but GPS (`gnss.signals.time_group`), the most usual first: a state joins with those before it."""
+"""The constellations other than GPS (`gnss.signals.time_group`), the most common first: activating the offset of one
+activates those before it.
+"""
 
 OPTIONAL_CAPACITY = sum(OPTIONAL_SIZES.values())
 
 ERROR_CAPACITY = ERROR_SIZE + OPTIONAL_CAPACITY
 
 NOWHERE = ERROR_CAPACITY
-"""The place of an optional error that is switched off: behind every error there can be."""
+"""Index of an augmented state that is switched off: it is never below ``state.error_size``."""
 
 SOURCES = 2
-"""GNSS receivers with antennas of their own, by their index."""
+"""Number of GNSS receivers with an antenna of their own; the source of a fix is the index of its receiver."""

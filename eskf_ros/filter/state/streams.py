@@ -1,4 +1,4 @@
-"""Streams of measurements: when they come, and when they were accepted."""
+"""Streams of measurements: when their messages come, and when they are accepted."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ STREAMS = np.dtype(
     ],
     align=True,
 )
-"""By stream and source: the last measurement and the usual interval (ns), the last accepted one and since when they
-are,
-and how many were rejected in a row.
+"""Arrival and acceptance by stream and source.
+
+``last_stamp``, ``interval``: the last measurement (ns), and the usual time between two (ns). ``fused_stamp``,
+``fused_since``: the last accepted one (ns), and since when they have been accepted (ns). ``rejected``: rejections in a
+row.
 """

@@ -5,4 +5,4 @@ from __future__ import annotations
 SECOND = 1_000_000_000
 
 NEVER = -(2**62)
-"""Stamp before everything."""
+"""Stamp before all others: of what has not happened yet."""

@@ -1,16 +1,17 @@
-"""Does the robot stand still? Readings of the IMU since the last point on the grid of the constraints, and evidence.
+"""Static detector for ZUPT and ZARU: is the robot stationary at a grid point of the constraints?
 
-At constant velocity an IMU reads what it reads at rest. That it is quiet is therefore necessary and not enough:
+At constant velocity an IMU reads what it reads at rest. Quiet readings are therefore necessary but not sufficient:
 
-- Sensors that see motion decide, if there are any: GNSS velocity, wheels, the velocity of the body, how far fixes have
-  moved since the IMU became quiet. Motion seen by any of them (air pressure that changes is motion, too) is a veto, and
-  rest seen by one of them is enough.
-- When none of them has said anything for a while (a tunnel), the readings have to be as quiet as they were when rest
-  was seen; and unless this robot was always much less quiet when motion was seen, the estimate itself has to say that
-  it stands. What remains undetectable without such sensors: slow motion at constant velocity, about a decimetre per
-  second, of a robot that moves as smoothly as it stands.
+- Sensors that see motion decide if there are any: GNSS velocity, wheels, body velocity, the displacement of fixes since
+  the IMU became quiet. Motion seen by any of them is a veto (a change of the air pressure is motion, too), and rest
+  seen by one of them is sufficient.
+- If no such sensor has reported for `EVIDENCE_LASTS` (a tunnel), the readings must be as quiet as they were when a
+  sensor saw rest. Unless the readings of this robot in motion were always plainly less quiet, the estimated velocity
+  must be near zero, too. Without such sensors one motion remains undetectable: about a decimetre per second at constant
+  velocity, of a robot that moves as smoothly as it stands.
 
-How quiet is the variance of raw readings, so that no bias counts. Everything lives in the state and is rewound with it.
+Quietness is measured by the variance of raw readings, which a bias does not change. All of it is part of the state, so
+that a rewind restores it.
 """
 
 from __future__ import annotations
@@ -51,66 +52,82 @@ REST = np.dtype(
     ],
     align=True,
 )
-"""IMU samples since the last grid point of the constraints, and evidence of rest and motion.
+"""IMU samples since the last grid point of the constraints (a block), and evidence of rest and motion.
 
-``block_*``: the grid point after them, whether a sample is missing, how many, sums, and those of the first half.
-``moving_stamp``, ``resting_stamp``: when another sensor last saw it; ``moving_activity``, ``resting_activity``: how
-quiet the IMU is then; ``quiet``: whether it was until the last grid point, with fix and pressure when it became so.
-``wheel_stamp``, ``slip_stamp``: when the wheels spoke last, and when the gate last refused them.
+- ``block_end``, ``block_broken``: the grid point that ends the block (ns), and whether a sample is missing in it.
+- ``block_count``, ``block_sum``, ``block_square_sum``: samples, sums and sums of squares (m/s2, rad/s).
+- ``block_half_count``, ``block_half_sum``: the same for the first half of the block.
+- ``moving_stamp``, ``resting_stamp``: when another sensor last saw motion and rest (ns).
+- ``moving_activity``, ``resting_activity``: learnt activity of the IMU (see `unrest`) in motion and at rest.
+- ``quiet``: whether the IMU was quiet in the last block.
+- ``quiet_fix_*``, ``quiet_pressure*``: fix and pressure at the time when the IMU became quiet.
+- ``wheel_stamp``, ``slip_stamp``: the last message of the wheels, and the last one that the gate rejected (ns).
 """
 
 FEWEST_SAMPLES = 3
-"""Of fewer samples in half an interval the spread says nothing."""
+"""Samples, at least, in each half of a block: fewer do not show the spread."""
 
 STEADY_SIGMAS = 4.0
-"""At rest the means of the two halves differ by no more."""
+"""Standard deviations by which the means of the two halves of a block may differ at rest."""
 
 EVIDENCE_LASTS = 1_500_000_000
-"""What a sensor saw counts for so long (ns)."""
+"""ns; what a sensor saw, rest or motion, counts for this long."""
 
 MOTION_SIGMAS = 4.0
+"""Standard deviations that a velocity must exceed to prove motion."""
+
 LEAST_MOTION = 0.1
-"""A velocity proves motion that exceeds so many sigma, and this (m/s) ..."""
+"""m/s; a smaller velocity does not prove motion."""
 
 REST_SIGMAS = 3.0
+"""A velocity or a displacement indicates rest only if it is below its standard deviation times this factor."""
+
 WORST_REST_STD = 0.3
-"""... and speaks for rest below so many, if its sigma is no larger than this (m/s)."""
+"""m/s; a velocity with a larger standard deviation does not indicate rest."""
 
 DISPLACEMENT_SIGMAS = 5.0
+"""Standard deviations that a displacement of fixes, or a change of pressure, must exceed to prove motion."""
+
 WORST_DISPLACEMENT_STD = 0.1
-"""The same for the displacement between two fixes, divided by the time between them."""
+"""m/s; a displacement indicates rest only if its standard deviation over the elapsed time is below this."""
 
 WAY_LASTS = 3_000_000_000
-"""Before that displacement is measured over so long (ns)."""
+"""ns; while the IMU is not quiet, the displacement is measured from a fix that is at most this old."""
 
 STANDING_SPEED = 0.01
+"""m/s; wheels stand below this speed: they do not scatter around zero."""
+
 STANDING_YAW_RATE = 0.01
-"""Wheels stand below this (m/s, rad/s): they do not scatter around zero."""
+"""rad/s; wheels stand below this yaw rate."""
 
 PRESSURE_LASTS = 30_000_000_000
-"""For so long (ns) the weather does not change the pressure by as much as a storey does."""
+"""ns; within this time the weather changes the pressure by less than a storey of height does."""
 
 AS_QUIET = 4.0
-"""Rest with twice the deviations of rest seen before is as quiet."""
+"""Ratio of the activity (a variance) to that learnt at rest up to which the readings are as quiet as at rest."""
 
 LEARNING = 0.1
+"""Weight of a new block in the running mean of the activity at rest."""
+
 FORGETTING = 0.002
-"""How quickly the level of rest follows, and that of the quietest motion rises again, per grid interval."""
+"""Weight of a new block with which the lowest activity in motion rises again."""
 
 LOUDEST = 2.0
-"""Rest that is louder counts as so many times the level learnt: it may be the moment before the wheels turn."""
+"""A block counts with at most this many times the activity learnt at rest: the robot may be about to start."""
 
 PLAINLY_LESS_QUIET = 9.0
-"""With three times the deviations motion cannot be taken for rest."""
+"""Ratio of the activities (variances) in motion and at rest above which the two cannot be confused."""
 
 UNSEEN_SPEED = 0.3
+"""m/s; largest estimated speed at which rest is accepted that no sensor sees and the activity alone does not show."""
+
 UNSEEN_SPEED_STD = 0.2
-"""Otherwise rest that no sensor sees needs an estimate that says so itself: speed and its sigma below these (m/s)."""
+"""m/s per axis; largest standard deviation of the estimated velocity in the same case."""
 
 
 @njit
 def add_to_block(state, settings):
-    """Add the newest IMU sample to the sums since the last grid point."""
+    """Add the newest IMU sample to the sums of the block; at the end of a block learn from it and begin the next."""
     end = -(-state.stamp // CONSTRAINT_INTERVAL) * CONSTRAINT_INTERVAL
     if state.rest.block_end != end:
         learn_from_block(state, settings)
@@ -138,34 +155,34 @@ def add_to_block(state, settings):
 
 @njit
 def is_complete(state):
-    """Say whether there are enough readings and no gap among them."""
+    """Say whether both halves of the block have enough samples and no gap is among them."""
     count = state.rest.block_half_count
     return state.rest.block_broken == 0 and count >= FEWEST_SAMPLES and state.rest.block_count - count >= FEWEST_SAMPLES
 
 
 @njit
 def has_block(state):
-    """Say whether the state stands at a grid point and has the readings before it."""
+    """Say whether the state is at a grid point and has a complete block of readings before it."""
     return state.rest.block_end == state.stamp and is_complete(state)
 
 
 @njit
 def mean_force(state):
-    """Return the mean specific force (m/s2, IMU axes, raw) since the last grid point."""
+    """Return the mean specific force (m/s2, IMU axes, raw) of the block."""
     n, total = state.rest.block_count, state.rest.block_sum
     return (total[0] / n, total[1] / n, total[2] / n)
 
 
 @njit
 def mean_rate(state):
-    """Return the mean angular rate (rad/s, IMU axes, raw) since the last grid point."""
+    """Return the mean angular rate (rad/s, IMU axes, raw) of the block."""
     n, total = state.rest.block_count, state.rest.block_sum
     return (total[3] / n, total[4] / n, total[5] / n)
 
 
 @njit
 def unrest(state, settings):
-    """Return the sum of the variances of the readings over the largest that may still be rest; -1 if one exceeds it."""
+    """Return the activity: the sum of the six variances over their limits at rest; -1 if one is above its limit."""
     total = 0.0
     for i in range(6):
         mean = state.rest.block_sum[i] / state.rest.block_count
@@ -179,10 +196,10 @@ def unrest(state, settings):
 
 @njit
 def is_steady(state, settings):
-    """Say whether the means of both halves agree within noise and swaying: no push, no turn, no hand that holds it.
+    """Say whether the means of both halves of the block agree within noise and swaying: no push, no turn, no hand.
 
-    Vibration averages out, motion does not. Three velocities, at the ends and in the middle, make the difference of two
-    mean accelerations.
+    Vibration averages out over half a block, motion does not. The difference of two mean accelerations comes from three
+    velocities, at both ends and in the middle, each of which sways by the standard deviation of the ZUPT.
     """
     half = 0.5e-9 * CONSTRAINT_INTERVAL
     sway = 6.0 * (settings.zupt.velocity_std / half) ** 2
@@ -202,7 +219,7 @@ def is_steady(state, settings):
 
 @njit
 def learn_from_block(state, settings):
-    """At the end of a block: how quiet are rest and motion that were seen? Where did the robot become quiet?"""
+    """Learn at the end of a block how quiet seen rest and motion are, and note where the robot became quiet."""
     level = unrest(state, settings) if is_complete(state) and is_steady(state, settings) else -1.0
     moved = state.rest.moving_stamp > state.rest.block_end - CONSTRAINT_INTERVAL
     rested = state.rest.resting_stamp > state.rest.block_end - CONSTRAINT_INTERVAL
@@ -228,7 +245,7 @@ def learn_from_block(state, settings):
 
 @njit
 def is_resting(state, settings):
-    """Say whether the robot has stood still since the last grid point, at which the state stands."""
+    """Say whether the robot has been stationary since the last grid point; the state is at a grid point."""
     if not (has_block(state) and is_steady(state, settings)):
         return False
     level = unrest(state, settings)
@@ -249,7 +266,7 @@ def is_resting(state, settings):
 
 @njit
 def update_rest_evidence(state, aid):
-    """Look at a measurement of any sensor for rest or motion, whatever the filter will make of it.
+    """Look for rest or motion in a measurement of any sensor, whatever the filter will make of it.
 
     Returns whether it disproves the last level (`static_window.update_motion`).
     """
@@ -278,7 +295,7 @@ def update_rest_evidence(state, aid):
 
 @njit
 def weigh_speed(state, stamp, speed, std, is_whole):
-    """Take a speed (m/s) as evidence; only one that ``is_whole``, with all three axes, can speak for rest."""
+    """Take a speed (m/s) as evidence of motion, or of rest if it ``is_whole``: measured along all three axes."""
     if speed > max(MOTION_SIGMAS * std, LEAST_MOTION):
         state.rest.moving_stamp = stamp
     elif is_whole and speed < REST_SIGMAS * std and std < WORST_REST_STD:
@@ -287,7 +304,7 @@ def weigh_speed(state, stamp, speed, std, is_whole):
 
 @njit
 def note_displacement(state, aid):
-    """Look how far a fix is from the one at which the IMU became quiet, or, until then, from one a few seconds old."""
+    """Compare a fix with the one at which the IMU became quiet or, while it is not, with one a few seconds old."""
     fix = geodetic_to_ecef(aid.payload[0], aid.payload[1], aid.payload[2])
     variance = max(aid.payload[3], aid.payload[6], aid.payload[8])
     source = aid.source
@@ -309,7 +326,7 @@ def note_displacement(state, aid):
 
 @njit
 def note_pressure(state, aid):
-    """Look whether the air pressure (Pa) has changed since the IMU became quiet: up and down is motion, too."""
+    """Compare the air pressure (Pa) with that at which the IMU became quiet: up and down is motion, too."""
     if state.rest.quiet == 0 or aid.stamp - state.rest.quiet_pressure_stamp > PRESSURE_LASTS:
         state.rest.quiet_pressure_stamp = aid.stamp
         state.rest.quiet_pressure = aid.payload[0]
@@ -319,7 +336,7 @@ def note_pressure(state, aid):
 
 @njit
 def watch_wheels(state, aid):
-    """Note when the wheels spoke, and when the gate refused to believe them: they slip."""
+    """Note when the wheels reported last, and when the gate last rejected them, which means that they slip."""
     state.rest.wheel_stamp = aid.stamp
     if aid.verdict == Verdict.GATE:
         state.rest.slip_stamp = aid.stamp

@@ -1,8 +1,8 @@
-"""Motion that passes for rest: a boat in waves, sensors held in the hand, a car that brakes evenly.
+"""Residual motion within a quiet window: a boat in waves, sensors held in the hand, a car that brakes evenly.
 
-Within a window whose readings are quiet enough for rest, the mean rate would be taken for the gyro bias and the mean
-force for gravity. White noise and the vibration of an engine average out within a part of the window. What the means of
-the parts still differ by is motion that lasts, and the mean of the window may be wrong by as much.
+If such motion passed for rest, the mean rate would be taken for the gyro bias and the mean force for gravity. The
+window is therefore divided into parts. White noise and the vibration of an engine average out within a part. What the
+means of the parts still differ by is residual motion, and the mean of the window may be wrong by as much.
 """
 
 from __future__ import annotations
@@ -31,32 +31,41 @@ RESIDUAL_MOTION = np.dtype(
     ],
     align=True,
 )
-"""Whether the robot moved when the window began; the part being filled, sums over the means of the others, and the
-largest
-variances of these means ((m/s2)2, (rad/s)2) in the run of still windows.
+"""The parts of the static window, and the residual motion that they show.
+
+- ``moved_first``: whether the robot moved when the window began.
+- ``part_start``, ``part_count``, ``part_sum``: start (ns), samples and sums (m/s2, rad/s) of the part being filled.
+- ``parts``, ``part_mean_sum``, ``part_square_sum``: number of full parts, sums of their means and of the squares.
+- ``force_variance``, ``rate_variance``: largest variance of the means in the present run of still windows ((m/s2)2,
+  (rad/s)2).
 """
 
 PART = 250_000_000
-"""Length of a part (ns)."""
+"""ns; length of a part."""
 
 FEWEST_PARTS = 4
+"""Parts, at least, whose means show residual motion."""
 
 MOVING_SPEED = 0.5
-"""What is faster (m/s) beyond its uncertainty moves."""
+"""m/s; a robot moves if its speed exceeds this by more than its uncertainty."""
 
 REST_SIGMAS = 2.0
-"""A window is no rest while the filter has a velocity of this many sigma: better one too few than even braking."""
+"""A window is not at rest while the estimated speed exceeds `MOVING_SPEED` by this many standard deviations: rather a
+missed window than one of even braking.
+"""
 
 MORE_THAN_NOISE = 5.0
-"""The variance of the means is above this many times that of white noise by accident in one of thousands of windows."""
+"""Ratio of the variance of the means to that of white noise above which there is residual motion: noise alone exceeds
+it in one of thousands of windows.
+"""
 
 BIAS_SIGMAS = 4.0
-"""No gyro bias is further from what was expected."""
+"""Standard deviations by which a gyro bias may differ from its expected value."""
 
 
 @njit
 def add_to_part(state):
-    """Add the newest IMU sample to the part of the stillness window, whose beginning begins the parts anew."""
+    """Add the newest IMU sample to the present part of the static window; a new window begins with new parts."""
     if state.window.start == NEVER:
         state.residual.moved_first = 1 if is_moving(state) else 0
         state.residual.part_start = state.stamp
@@ -84,7 +93,7 @@ def add_to_part(state):
 
 @njit
 def is_moving(state):
-    """Say whether the velocity that GNSS has given the filter is rather not that of a robot at rest."""
+    """Say whether the velocity that the filter has from GNSS is too large for a robot at rest."""
     if state.position_known == 0:
         return False
     v = state.velocity_map
@@ -96,9 +105,9 @@ def is_moving(state):
 
 @njit
 def sway_variance(state, first, noise_density):
-    """Return the variance of the means of the parts if it is more than that of white noise; three axes from ``first``.
+    """Return the variance of the means of the parts, for three axes from ``first``; 0 if white noise explains it.
 
-    0: of the force ((m/s2)2), 3: of the rate ((rad/s)2). The largest of the axes counts.
+    ``first`` 0: specific force ((m/s2)2); 3: angular rate ((rad/s)2). The axis with the largest variance counts.
     """
     n = state.residual.parts
     if n < FEWEST_PARTS:
@@ -113,7 +122,7 @@ def sway_variance(state, first, noise_density):
 
 @njit
 def note_sway(state, is_first, settings):
-    """Keep the largest sway of an unbroken run of still windows, of which this is the first or a further one."""
+    """Keep the largest residual motion in a run of still windows; ``is_first``: this window is the first of the run."""
     force = sway_variance(state, 0, settings.accel_noise_density)
     rate = sway_variance(state, 3, settings.gyro_noise_density)
     state.residual.force_variance = force if is_first else max(state.residual.force_variance, force)
@@ -122,7 +131,11 @@ def note_sway(state, is_first, settings):
 
 @njit
 def can_be_bias(rate, expected, std, noise):
-    """Say whether a mean rate (rad/s) can be Earth rate and gyro bias, expected with ``std``; ``noise``: std."""
+    """Say whether a mean rate (rad/s) can be Earth rate plus gyro bias.
+
+    The bias is ``expected`` (rad/s) with the standard deviation ``std``; ``noise`` is the standard deviation of the
+    mean rate.
+    """
     limit = BIAS_SIGMAS * math.sqrt(std * std + noise * noise) + EARTH_RATE
     for i in range(3):
         if abs(rate[i] - expected[i]) > limit:

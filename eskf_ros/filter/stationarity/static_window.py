@@ -1,4 +1,4 @@
-"""Windows of IMU readings in which the robot stands still, from which it is levelled, and proof of motion."""
+"""Static windows: IMU readings from which a robot at rest is levelled, and proof of motion by other sensors."""
 
 from __future__ import annotations
 
@@ -33,36 +33,43 @@ STATIC_WINDOW = np.dtype(
     ],
     align=True,
 )
-"""The static window being filled, the unbroken run of still windows before it, and evidence of motion from outside.
+"""The static window being filled, the unbroken run of still windows before it, and evidence of motion from other
+sensors.
 
-Sums of force (m/s2) and rate (rad/s). ``motion_stamp``: when GNSS last proved motion. ``last_fix_*``: by receiver,
-whose antennas are apart; ``anchor_*``: the fix from which the window started.
+- ``start``, ``samples``, ``total``, ``square_total``: the window: first stamp (ns), samples, sums (m/s2, rad/s).
+- ``still_stamp``, ``still_samples``, ``still_total``: the end of the last still window (ns), samples and sums of the
+  run.
+- ``motion_stamp``: when another sensor last proved motion (ns).
+- ``last_fix_*``: the last fix by receiver, because their antennas are apart: stamp (ns), ECEF (m), variance (m2).
+- ``anchor_*``: the fix by receiver from which the window started.
 """
 
 POSITION_SIGMAS = 5.0
-VELOCITY_SIGMAS = 3.0
-"""What GNSS has to exceed (m/s) by so many sigma to prove motion.
-
-Fixes are differenced, and over fractions of a second: at three sigma the noise of a parked robot's often passes.
+"""Standard deviations by which a displacement between fixes must exceed `MOVING_SPEED` to prove motion. Fixes are
+differenced, and over fractions of a second: at three standard deviations a parked robot would often pass.
 """
 
+VELOCITY_SIGMAS = 3.0
+"""Standard deviations by which a GNSS velocity must exceed `MOVING_SPEED` to prove motion."""
+
 REST_TOLERANCE = 0.2
-"""Change of the mean specific force across the vertical (m/s2) that a robot at rest may show: settling springs."""
+"""m/s2; change of the horizontal mean specific force that a robot at rest may show while its springs settle."""
 
 REST_RATE_SIGMAS = 4.0
-"""The mean rate at rest is the bias within this many sigma."""
+"""Standard deviations by which the mean rate at rest may differ from the estimated gyro bias plus Earth rate."""
 
 STRONGEST_START = 5.0
-"""No robot gathers speed faster (m/s2)."""
+"""m/s2; no robot gathers speed faster."""
 
 MINIMUM_WINDOW_SAMPLES = 10
+"""Samples, at least, of a full window."""
 
 
 class Window(IntEnum):
     """What the static window holds after a sample.
 
-    OPEN: it is not full yet. MOTION: the robot moved. REST: it stood still. UNPROVEN: as quiet as rest, but neither a
-    fix nor wheels came since it began, and a slow acceleration passes for a tilt.
+    OPEN: it is not full yet. MOTION: the robot moved. REST: it was stationary. UNPROVEN: its readings are as quiet as
+    at rest, but neither a fix nor wheels have come since it began, so that a slow acceleration would pass for a tilt.
     """
 
     OPEN = 0
@@ -73,11 +80,11 @@ class Window(IntEnum):
 
 @njit
 def update_static_window(state, settings):
-    """Add the newest IMU sample to the static window; return its `Window`. The caller closes one that is full."""
+    """Add the newest IMU sample to the static window; return its `Window`. The caller closes a full window."""
     if state.first_stamp == NEVER:
         state.first_stamp = state.stamp
     if state.imu.interval > settings.imu_gap:
-        # What a hole hides belongs to no window.
+        # A gap of the IMU may hide motion: no window spans it.
         state.window.start = NEVER
         state.window.still_samples = 0
     if state.window.start == NEVER:
@@ -106,7 +113,8 @@ def update_static_window(state, settings):
     if (
         still
         and state.position_known == 1
-        and max(state.window.last_fix_stamp.max(), state.rest.resting_stamp) < state.window.start
+        and max(state.window.last_fix_stamp[0], state.window.last_fix_stamp[1], state.rest.resting_stamp)
+        < state.window.start
     ):
         window = Window.UNPROVEN
     if window != Window.REST:
@@ -123,13 +131,13 @@ def update_static_window(state, settings):
 
 @njit
 def close_static_window(state):
-    """Let the next IMU sample begin a new window."""
+    """Close the static window, so that the next IMU sample begins a new one."""
     state.window.start = NEVER
 
 
 @njit
 def update_evidence_from_fix(state, aid):
-    """Remember a fix, and what it says about motion; see `update_motion` for what is returned."""
+    """Keep a fix, and compare it with the anchor of the window; return whether the last level is disproved."""
     fix = geodetic_to_ecef(aid.payload[0], aid.payload[1], aid.payload[2])
     std = math.sqrt(max(aid.payload[3], aid.payload[6], aid.payload[8]))
     return update_evidence_from_place(state, fix, std, aid.stamp, aid.source)
@@ -137,7 +145,10 @@ def update_evidence_from_fix(state, aid):
 
 @njit
 def update_evidence_from_place(state, ecef, std, stamp, source):
-    """Remember the place (m) of an antenna, and look how far it is from that before the current static window."""
+    """Keep the position (m, ECEF) of an antenna, and compare it with the anchor; return whether the level is disproved.
+
+    ``std`` (m) is the largest standard deviation of the axes. See `update_motion` for what is returned.
+    """
     is_disproved = False
     if NEVER < state.window.anchor_stamp[source] < stamp:
         a = state.window.anchor_ecef[source]
@@ -153,7 +164,7 @@ def update_evidence_from_place(state, ecef, std, stamp, source):
 
 @njit
 def update_evidence_from_velocity(state, aid):
-    """Look at a GNSS velocity; see `update_motion` for what is returned."""
+    """Look for motion in a GNSS velocity; return whether the last level is disproved (`update_motion`)."""
     speed = math.sqrt(aid.payload[0] ** 2 + aid.payload[1] ** 2 + aid.payload[2] ** 2)
     std = math.sqrt(max(aid.payload[3], aid.payload[6], aid.payload[8]))
     return update_motion(state, speed - VELOCITY_SIGMAS * std, aid.stamp, aid.stamp)
@@ -161,10 +172,10 @@ def update_evidence_from_velocity(state, aid):
 
 @njit
 def update_motion(state, speed, since, stamp):
-    """Take a speed (m/s) that its noise leaves, the mean from ``since`` to ``stamp``, as proof of motion.
+    """Take a speed (m/s), its uncertainty subtracted, as proof of motion; return whether it disproves the last level.
 
-    Returns whether the last level is disproved: no robot can have gathered that speed since the last window that passed
-    as still, so that window was none.
+    The speed is the mean from ``since`` to ``stamp`` (ns). The level is disproved if no robot can have gathered that
+    speed since the last still window: then that window was not at rest.
     """
     if speed <= MOVING_SPEED:
         return False
@@ -188,10 +199,10 @@ def is_still(state, settings):
 
 @njit
 def is_same_rest(state, settings):
-    """Say whether rate and gravity are still where the last still window left them.
+    """Say whether mean rate and gravity agree with the last still window, so that both windows are the same rest.
 
-    A creeping turn is as quiet as rest, but its rate is none that the bias can have come to since. A steady
-    acceleration looks like a tilt, but one that no gyro has seen.
+    A slow turn is as quiet as rest, but the gyro bias cannot have walked to its rate since the last window. A steady
+    acceleration looks like a tilt, but the gyros have not seen such a tilt.
     """
     if state.level_known == 0 or state.window.still_stamp == NEVER:
         return True

@@ -1,25 +1,25 @@
-"""Ranges: the signals of one epoch, which say more together than one by one.
+"""Fusion of the signals of one epoch, which say more together than one by one.
 
-Each signal is a measurement of its own and goes through the one update. Before that the epoch is looked at as a whole,
-because a receiver clock that has jumped, a state that is wrong and a satellite that is wrong all look the same to a
-single signal. Everything here is a function of the state and of the signals with one stamp, in their total order.
+Each signal is a measurement of its own and goes through the one update. Before that the epoch is examined as a whole,
+because a jump of the receiver clock, a wrong state and a wrong satellite look the same to a single signal. Everything
+here is a function of the state and of the signals with one stamp, in their total order.
 
-- A whole number of milliseconds in common is a jump of the receiver's clock, any other common part a clock that was
-  set anew: neither costs a satellite.
-- More than half of at least five satellites outside their gates: the state is wrong, not they, and is given the
-  uncertainty that they show.
-- A single satellite outside its gate is refused; from 2.5 standard deviations up to the gate it weighs less (Huber,
-  Robust Statistics, section 7.8).
+- A common innovation of whole milliseconds is a jump of the receiver clock; any other common innovation is a clock that
+  was set anew. Neither costs a satellite.
+- More than half of at least `FEWEST_TO_JUDGE` satellites outside their gates: the state is wrong, and its variance is
+  inflated by what they show.
+- A single satellite outside its gate is rejected (fault exclusion); from `HUBER` standard deviations up to the gate its
+  noise is inflated (Huber, Robust Statistics, section 7.8).
 
-Least squares over the epoch alone give the position at the start, what the search for the heading and the stillness
-windows want to know, and outliers where the state is too uncertain to tell them.
+Least squares over the epoch alone give the first position, evidence for the static windows and the heading search, and
+outliers where the state is too uncertain to tell them.
 """
 
 from __future__ import annotations
 
 import math
 
-from eskf_ros.compiled import njit
+from eskf_ros.compiled import njit, njit_in_caller
 from eskf_ros.filter.alignment.heading import search_with
 from eskf_ros.filter.alignment.levelling import reset_level_to_moving
 from eskf_ros.filter.history.timeline import open_record
@@ -56,34 +56,34 @@ from eskf_ros.filter.tight.signal import (
 from eskf_ros.geodesy.rotation import cross, dot, rotate, to_matrix
 
 FEWEST_TO_JUDGE = 5
-"""Satellites of which the majority may outvote the state."""
+"""Satellites, at least, whose majority outvotes the state."""
 
 FEWEST_FOR_CLOCK = 3
-"""Satellites that tell a clock that was set anew."""
+"""Satellites, at least, that show a clock that was set anew."""
 
 
 WIDE = (30.0, 3.0)
-"""Standard deviation of position and velocity per axis (m, m/s) beyond which the state cannot tell outliers."""
+"""Standard deviation per axis of position (m) and velocity (m/s) beyond which the state cannot tell outliers."""
 
 
 @njit
 def is_range(stream):
-    """Say whether a stream carries signals."""
+    """Say whether a stream carries the signals of satellites."""
     return stream in (Stream.PSEUDORANGE, Stream.RANGE_RATE)
 
 
 @njit
 def end_of_epoch(aids, first, count):
-    """Return the index behind the signals with stamp and stream of ``aids[first]``; ``count`` aids are there."""
+    """Return the index after the signals with stamp and stream of ``aids[first]``; ``count`` measurements are there."""
     end = first + 1
     while end < count and aids[end].stamp == aids[first].stamp and aids[end].stream == aids[first].stream:
         end += 1
     return end
 
 
-@njit
+@njit_in_caller
 def fuse_ranges(state, aids, first, end, settings, work):
-    """Offer the signals of one stream and epoch, ``aids[first:end]``; leave the verdict in the record of each."""
+    """Fuse or refuse the signals ``aids[first:end]`` of one stream and epoch; write the verdict to each record."""
     waiting = False
     for i in range(first, end):
         if open_record(aids, i):
@@ -96,9 +96,9 @@ def fuse_ranges(state, aids, first, end, settings, work):
     note_jump(state, position, heading, settings)
 
 
-@njit
+@njit_in_caller
 def offer_epoch(state, aids, first, end, which, settings, work):
-    """Fuse the signals of an epoch, pseudoranges (``which`` 0) or range rates (1), or refuse them."""
+    """Fuse or refuse the pseudoranges (``which`` 0) or range rates (1) of an epoch, start and clock included."""
     if state.level_known == 0:
         note_coarsely(state, aids, first, end, which, settings, work)
     elif state.position_known == 0 and which == 0:
@@ -133,7 +133,7 @@ def offer_epoch(state, aids, first, end, which, settings, work):
 
 @njit
 def fuse_signal(state, aid, settings, work):
-    """Offer one signal to the state: in full, weighed down, or not at all."""
+    """Fuse one signal in full or with inflated noise, or refuse it."""
     if linearize(state, aid, settings, work) == 0:
         aid.verdict = Verdict.LOW_ELEVATION
         return
@@ -149,7 +149,11 @@ def fuse_signal(state, aid, settings, work):
 
 @njit
 def inflate_or_reset_by_majority(state, aids, first, end, which, settings, work):
-    """Where most satellites contradict the state, it is the state that is wrong: the clock, or position or velocity."""
+    """Reset the clock or inflate position or velocity, if most satellites contradict the state.
+
+    A common innovation is a clock that was set anew. Otherwise the variance of position or velocity and of the clock
+    gains the median of the squared innovations, scaled to a variance.
+    """
     count, gate = work.signal_count, settings.gate[aids[first].stream, 1]
     if count < FEWEST_FOR_CLOCK or 2 * outside(work, 0.0, gate) <= count:
         return
@@ -171,7 +175,7 @@ def inflate_or_reset_by_majority(state, aids, first, end, which, settings, work)
 
 @njit
 def is_wide(state, which):
-    """Say whether position (``which`` 0) or velocity (1) are too uncertain to tell outliers."""
+    """Say whether position (``which`` 0) or velocity (1) is too uncertain to tell outliers."""
     block = POSITION if which == 0 else VELOCITY
     p = state.covariance
     variance = p[block, block] + p[block + 1, block + 1] + p[block + 2, block + 2]
@@ -180,7 +184,7 @@ def is_wide(state, which):
 
 @njit
 def note_solution(state, stamp, which, settings, work):
-    """Let what the epoch alone says take part in the stillness windows and in the search for the heading."""
+    """Use the solution of the epoch alone as evidence for the static windows and in the heading search."""
     step = (work.step[0], work.step[1], work.step[2])
     std = math.sqrt(max(work.normal[0, 0], work.normal[1, 1], work.normal[2, 2]))
     rotation = to_matrix(state.attitude)

@@ -1,7 +1,7 @@
-"""Least squares over the signals of one epoch, with weights that outliers lose (Huber, Robust Statistics, section 7.8).
+"""Least squares over the signals of one epoch with robust weights (Huber, Robust Statistics, section 7.8).
 
 The point solution of the inputs (`gnss.point_solution`) solves the same problem for a receiver without a filter, in
-ECEF and with its own atmosphere; here the linearization is that of the filter, in map axes, and nothing is allocated.
+ECEF and with its own atmosphere. Here the linearization is that of the filter, in map axes, and nothing is allocated.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from eskf_ros.filter.tight.pseudorange import offset_place
 from eskf_ros.filter.tight.signal import system_of
 
 LARGEST_EPOCH = 256
-"""Signals of one epoch that are solved together; further ones are taken one by one."""
+"""Signals of one epoch that are solved together, at most; the others are fused one by one."""
 
 HUBER = 2.5
-"""Standard deviations from which on a signal weighs less (Huber's constant)."""
+"""Standard deviations from which on the weight of a signal decreases (Huber's constant)."""
 
 FEWEST_TO_SOLVE = 4
-"""Satellites that fix a position and the clock."""
+"""Satellites, at least, that determine a position and the clock."""
 
 FEWEST_TO_EXCLUDE = 6
-"""Satellites that show which one of them is wrong."""
+"""Satellites, at least, that show which one of them is wrong."""
 
 OUTLIER = 4.0
-"""Standard deviations, in units of what most signals show, beyond which one contradicts the others."""
+"""Residual beyond which a signal is an outlier, in units of the spread that most signals show."""
 
 MEDIAN_OF_SQUARES = 0.455
 """Median of the square of a standard normal variable."""
 
 REWEIGHTINGS = 20
-"""Solutions of the weighted least squares with weights that follow from the residuals of the last."""
+"""Iterations of the weighted least squares, at most; the weights follow from the residuals of the iteration before."""
 
 
 @njit
@@ -54,7 +54,7 @@ def median(values, count, work):
 
 @njit
 def outside(work, shift, gate):
-    """Return how many of the gathered signals are outside the gate when ``shift`` is taken out of all of them."""
+    """Return how many of the gathered signals are outside the gate once the common ``shift`` is subtracted."""
     count = 0
     for k in range(work.signal_count):
         if (work.signal_innovation[k] - shift) ** 2 > gate * work.signal_spread[k]:
@@ -64,7 +64,7 @@ def outside(work, shift, gate):
 
 @njit
 def reject_outliers(aids, work):
-    """Refuse the signals that contradict the others: by their residuals, in units of what most of them show."""
+    """Reject the signals whose residuals are large compared with those of most signals."""
     count = work.signal_count
     if count < FEWEST_TO_EXCLUDE:
         return
@@ -83,9 +83,9 @@ def reject_outliers(aids, work):
 def solve_epoch(work):
     """Solve the gathered signals for a step of position or velocity and of the clock; say whether they suffice.
 
-    Least squares with Huber's weights, iterated; the sum it minimises is convex: where it begins does not matter. Step
-    to ``work.step``, covariance to ``work.normal`` (grown where residuals are larger than the noise says), residuals in
-    units of the noise to ``work.signal_residual``.
+    Least squares with Huber's weights, iterated; the sum that it minimises is convex, so the result does not depend on
+    the initial weights. The step (m or m/s) goes to ``work.step``, its covariance to ``work.normal`` (inflated by
+    `variance_factor`), the residuals in units of the noise to ``work.signal_residual``.
     """
     count, normal, step = work.signal_count, work.normal, work.step
     if count < FEWEST_TO_SOLVE:
@@ -132,10 +132,10 @@ def solve_epoch(work):
 
 @njit
 def variance_factor(work):
-    """Return by how much the squares of the residuals are larger than the noise says, at least 1.
+    """Return the factor (at least 1) by which the squared residuals exceed the noise.
 
-    From their median, which the outliers among them do not change much; with so few that no outlier can be told, from
-    their mean.
+    It follows from the median of the squares, on which outliers have little influence. With too few signals to tell an
+    outlier it follows from their mean.
     """
     count, total = work.signal_count, 0.0
     if count == FEWEST_TO_SOLVE:
@@ -151,7 +151,7 @@ def variance_factor(work):
 
 @njit
 def spread_of(work):
-    """Return the standard deviation of the solved position (m) or velocity (m/s), all axes together."""
+    """Return the standard deviation of the solved position (m) or velocity (m/s) over all axes together."""
     return math.sqrt(work.normal[0, 0] + work.normal[1, 1] + work.normal[2, 2])
 
 
@@ -165,10 +165,10 @@ def linearize(state, aid, settings, work):
 
 @njit
 def gather(state, aids, first, end, settings, work):
-    """Write what the signals that still wait say to ``work.signal_*``: innovation, its variance, noise, direction.
+    """Write innovation, its variance, noise and direction of the signals that still wait to ``work.signal_*``.
 
-    The noise contains what is not known of the offset of the constellation, so that signals of all constellations can
-    be compared.
+    The noise includes the uncertainty of the offset of the constellation, so that signals of all constellations can be
+    compared.
     """
     count = 0
     for i in range(first, end):

@@ -1,4 +1,4 @@
-"""The first position from the pseudoranges of one epoch, and proof of motion before that."""
+"""The first position from the pseudoranges of one epoch, and proof of motion before it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from eskf_ros.geodesy.earth import SEMI_MAJOR_AXIS, ecef_to_geodetic
 from eskf_ros.geodesy.rotation import dot, rotate
 
 COARSE_STD = (30.0, 0.3)
-"""Of a signal without atmosphere and weights (m, m/s)."""
+"""Standard deviation of a pseudorange (m) and a range rate (m/s) without atmosphere and weights."""
 
 POOREST_STD = 500.0
 """m; a solution with a larger formal standard deviation is no position."""
@@ -30,18 +30,21 @@ HIGHEST_ALTITUDE = 100e3
 """m; a solution above it is no position."""
 
 UNWEIGHTED = 1e9
-"""m; standard deviation of a signal while the position is far off, so that none is an outlier."""
+"""m; standard deviation of a signal while the position is far off: so large that no signal is an outlier."""
 
 NEAR = 1e4
-"""m; a step shorter than this leads into the neighbourhood of the position, where outliers can be told."""
+"""m; after a step shorter than this the position is near enough to tell outliers."""
 
 ITERATIONS = 15
-"""Steps of the first position, from the centre of the Earth."""
+"""Steps of the first position from below the satellites, at most."""
 
 
 @njit
 def gather_coarsely(aids, first, end, position, which, std, work):
-    """As `gather`, in ECEF axes, for an antenna at rest at ``position`` (m): no state, no atmosphere, equal noise."""
+    """Write signals to ``work.signal_*`` like `gather`, for an antenna at rest at ``position`` (m), in ECEF axes.
+
+    Neither state nor atmosphere is used, and all signals have the noise ``std`` (m or m/s).
+    """
     count = 0
     for i in range(first, end):
         if aids[i].verdict != Verdict.WAITING or count == LARGEST_EPOCH:
@@ -59,7 +62,7 @@ def gather_coarsely(aids, first, end, position, which, std, work):
 
 @njit
 def locate_coarsely(aids, first, end, work):
-    """Return whether the pseudoranges of an epoch give a position, and that (ECEF, to some ten m)."""
+    """Return whether the pseudoranges of an epoch give a position, and the position (m, ECEF, good to some ten m)."""
     x, y, z = 0.0, 0.0, 0.0
     for i in range(first, end):
         if aids[i].verdict == Verdict.WAITING:
@@ -69,7 +72,7 @@ def locate_coarsely(aids, first, end, work):
     length = math.sqrt(x * x + y * y + z * z)
     if not length > 0.0:
         return False, (0.0, 0.0, 0.0)
-    # The place on the Earth below the middle of the satellites.
+    # Begin at the point of the Earth below the mean of the satellites.
     scale = SEMI_MAJOR_AXIS / length
     position = (x * scale, y * scale, z * scale)
     # Far off, the residuals of the curved problem say nothing about the ranges: no weights.
@@ -92,7 +95,7 @@ def locate_coarsely(aids, first, end, work):
 
 @njit
 def note_coarsely(state, aids, first, end, which, settings, work):
-    """Before the attitude is level: take a motion that the epoch proves, so that it is not levelled in."""
+    """Look for motion in an epoch before the attitude is level, so that the robot is not levelled while it moves."""
     stamp = aids[first].stamp
     if which == 0:
         found, position = locate_coarsely(aids, first, end, work)
@@ -112,7 +115,7 @@ def note_coarsely(state, aids, first, end, which, settings, work):
 
 @njit
 def start(state, aids, first, end, settings, work):
-    """Take the first position from the pseudoranges of one epoch, which then make its wide prior narrow."""
+    """Set the first position from the pseudoranges of one epoch, whose updates then narrow its wide prior."""
     found, ecef = locate_coarsely(aids, first, end, work)
     if not found:
         return

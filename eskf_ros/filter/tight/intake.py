@@ -1,4 +1,4 @@
-"""The signals of an epoch on their way into the timeline."""
+"""Intake of the signals of an epoch into the timeline."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from eskf_ros.filter.tight.signal import (
 from eskf_ros.gnss.ranges import CODE_VALID, DOPPLER_VALID, Status
 
 LARGEST_NUMBER = 1e11
-"""Beyond every range, satellite and GPS time (m, m/s, s)."""
+"""Larger than every range (m), satellite position (m) and GPS time (s)."""
 
 
 @njit
@@ -33,9 +33,10 @@ def offer_signals(
 ):
     """Sort the usable signals (MEASURED_SIGNAL) of one epoch into the timeline, which has room for two of each.
 
-    ``gps_time``: s since 6 January 1980, ``klobuchar``: parameters of the ionosphere (8,), ``field``: the Earth's
-    magnetic field there as `mag.note_field` wants it, zeros if unknown. Returns how many never enter; ``refused``
-    (RECORD) says which and why.
+    ``gps_time``: s since 6 January 1980; ``klobuchar``: parameters of the ionosphere (8,); ``field``: the Earth's
+    magnetic field there as `mag.note_field` wants it, zeros if unknown; ``code_door``, ``rate_door``: verdict with
+    which pseudoranges and range rates are admitted. Returns how many never enter; ``refused`` (RECORD) tells which and
+    why.
     """
     payload = offered[0].payload
     count = 0
@@ -49,7 +50,7 @@ def offer_signals(
                 continue
             source = source_of(signal["gnss_id"], signal["sv_id"], signal["signal"])
             door = code_door if is_code else rate_door
-            payload[:] = 0.0
+            payload.fill(0.0)
             payload[MEASURED] = signal["pseudorange"] if is_code else signal["range_rate"]
             payload[STD] = signal["code_std"] if is_code else signal["range_rate_std"]
             for i in range(3):
@@ -62,8 +63,10 @@ def offer_signals(
             payload[GPS_TIME] = gps_time
             if door == Verdict.WAITING:
                 door = judge_signal(payload)
-            payload[KLOBUCHAR : KLOBUCHAR + 8] = klobuchar
-            payload[FIELD : FIELD + 4] = field
+            for i in range(8):
+                payload[KLOBUCHAR + i] = klobuchar[i]
+            for i in range(4):
+                payload[FIELD + i] = field[i]
             verdict = offer_aid(aids, timeline, offered, stamp, arrival, stream, source, door)
             if verdict != Verdict.WAITING:
                 record = refused[count]
@@ -78,7 +81,7 @@ def offer_signals(
 
 @njit
 def judge_signal(payload):
-    """Return whether the door is open to a signal: its numbers must be some, and no larger than they can be."""
+    """Return the verdict on the admission of a signal: its numbers must be finite and not absurdly large."""
     largest = max(abs(payload[MEASURED]), abs(payload[GPS_TIME]))
     for i in range(SATELLITE, SATELLITE_VELOCITY + 3):
         if math.isnan(payload[i]):

@@ -1,13 +1,14 @@
-"""Pseudorange of one signal (payload: see ``signal``).
+"""Pseudorange of one signal (payload: see `signal`).
 
     pseudorange = |satellite - antenna| + clock bias + offset of the constellation + ionosphere + troposphere
 
 (Groves, section 9.4.1, satellite clock taken out). Jacobian: minus the line of sight u for the position, u x lever for
-the attitude on the map side, one for clock bias and offset. The atmosphere is that of the current position.
+the attitude on the map side, one for clock bias and offset. The atmosphere is that at the present position.
 
-What lasts in the errors of all ranges together (reflections, orbits, atmosphere) may be an optional state: it moves the
-antenna that the satellites see by a standard deviation times a state of unit variance per axis (first-order
-Gauss-Markov). Vertically more than horizontally: what the models leave of the atmosphere is above, on all sides.
+The correlated error that all ranges have in common (reflections, orbits, atmosphere) may be an augmented state: it
+moves the antenna that the satellites see by a standard deviation times a state of unit variance per axis (first-order
+Gauss-Markov). It is larger vertically, because all satellites are above: the unmodelled atmosphere does not average
+out.
 """
 
 from __future__ import annotations
@@ -51,13 +52,13 @@ from eskf_ros.gnss.weighting import DEFAULT_WEIGHTING, code_std
 
 SIZE = 1
 
-# Place of a constellation among the offsets, -1 for GPS, to which they refer.
+# Index of a constellation among the offsets; -1 for GPS, the reference of all offsets.
 _ORDER = np.array([INTER_SYSTEM.index(group) if group in INTER_SYSTEM else -1 for group in range(GNSS_COUNT)])
 
 
 @njit
 def offset_place(system, settings):
-    """Return the place of the offset of a constellation in the error state; `NOWHERE` for GPS."""
+    """Return the index of the offset of a constellation in the error state; `NOWHERE` for GPS."""
     if _ORDER[system] < 0 or settings.inter_system_at == NOWHERE:
         return NOWHERE
     return settings.inter_system_at + _ORDER[system]
@@ -65,7 +66,7 @@ def offset_place(system, settings):
 
 @njit
 def delays(payload, geodetic, elevation, azimuth):
-    """Return the delays (m) in ionosphere (NaN without a model) and troposphere, at a place (rad, rad, m)."""
+    """Return the delays (m) by ionosphere (NaN without a model) and troposphere at a position (rad, rad, m)."""
     week = math.floor(payload[GPS_TIME] / SECONDS_PER_WEEK)
     seconds = payload[GPS_TIME] - week * SECONDS_PER_WEEK
     flags = int(payload[FLAGS])
@@ -104,7 +105,7 @@ def predict(state, payload, source, settings):
 
 @njit
 def variance(payload, source, elevation, ionosphere, settings):
-    """Return the variance (m2): the receiver's own where it gave one, else by elevation and C/N0; scaled, floored."""
+    """Return the variance (m2): that of the receiver, else by elevation and C/N0; scaled and floored."""
     square = payload[STD] ** 2
     if math.isnan(square):
         gnss_id, sv_id = satellite_of(source)
@@ -155,14 +156,14 @@ SETTINGS = np.dtype(
     ],
     align=True,
 )
-"""Lowest elevation (rad), factor on variances, floors (m, m/s), and what lasts in the errors of the ranges (m, map)."""
+"""Elevation mask (rad), factor on variances, floors (m, m/s), standard deviation of the common error (m, map)."""
 
 START_CLOCK_STD = (1000.0, 1000.0)
-"""Of a receiver clock (m, m/s) whose first value is the median of the satellites."""
+"""Standard deviation of bias (m) and drift (m/s) of a receiver clock that is set to the median of the satellites."""
 
 
 def describe(settings: np.void, parameters: Any) -> None:
-    """Fill in `SETTINGS`."""
+    """Fill `SETTINGS` from the parameters."""
     ranges: Ranges = parameters.ranges
     settings["elevation_mask"] = math.radians(ranges.elevation_mask_deg)
     settings["covariance_scale"] = ranges.covariance_scale
@@ -173,7 +174,7 @@ def describe(settings: np.void, parameters: Any) -> None:
 
 
 def augmented(parameters: Any) -> tuple[OptionalBlock, ...]:
-    """The clock of the receiver, and the offsets of the constellations, which join with the first signal of each."""
+    """Return the receiver clock, and the offsets of the constellations, which the first signal of each activates."""
     ranges: Ranges = parameters.ranges
     is_tight = parameters.mode == "tight"
     return (

@@ -1,10 +1,10 @@
-"""Range rate of one signal, from its Doppler (payload: see ``signal``).
+"""Range rate of one signal, from its Doppler (payload: see `signal`).
 
     range rate = u . (satellite velocity - antenna velocity) + clock drift
 
-(Groves, section 9.4.1, satellite drift taken out), u the line of sight, with the antenna's velocity + R (omega x
+(Groves, section 9.4.1, satellite drift taken out), u the line of sight, the antenna velocity = velocity + R (omega x
 lever_arm), omega the body rate relative to the Earth, free of the gyro bias. The Jacobian has the velocity, the
-position, which turns the line of sight, attitude and gyro bias, as for a GNSS velocity, and the clock drift.
+position (which turns the line of sight), attitude and gyro bias as for a GNSS velocity, and the clock drift.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ SIZE = 1
 def predict(state, payload, settings):
     """Return range rate (m/s), unit vector to the satellite (map), elevation (rad), turning of that vector (1/s, map).
 
-    The turning is how the range rate changes with the position of the antenna, but for the sign.
+    The turning is minus the derivative of the range rate by the position of the antenna.
     """
     antenna, velocity = antenna_ecef(state, settings)
     unit, length, rate = see(payload, antenna, velocity)
@@ -58,7 +58,7 @@ def predict(state, payload, settings):
 
 @njit
 def variance(payload, settings):
-    """Return the variance (m2/s2): the receiver's own where it gave one, else by C/N0; scaled, floored."""
+    """Return the variance (m2/s2): that of the receiver, else by C/N0; scaled and floored."""
     std = payload[STD]
     if math.isnan(std):
         std = doppler_std(DEFAULT_WEIGHTING, payload[CN0])
@@ -88,7 +88,7 @@ def linearize(state, payload, settings, work):
     if state.heading_known == 0:
         work.noise[0, 0] += dot(sway, sway)
         return SIZE
-    # An attitude error turns the sway, and the Earth rate into the body: [lever]x [Earth rate]x theta.
+    # An attitude error turns the velocity of the lever arm, and the Earth rate: [lever]x [Earth rate]x theta.
     earth = state.frame.earth_rate_map
     swayed = cross(unit, sway)
     # It moves the antenna too, and so turns the line of sight.

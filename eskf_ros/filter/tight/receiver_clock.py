@@ -1,4 +1,4 @@
-"""The receiver's clock: its first value, jumps by whole milliseconds, and a clock that was set anew."""
+"""The receiver clock: its first value, jumps by whole milliseconds, and a clock that was set anew."""
 
 from __future__ import annotations
 
@@ -23,24 +23,25 @@ TIGHT = np.dtype(
     ],
     align=True,
 )
-"""Tight coupling: whether clock bias and drift have values yet, milliseconds the clock has jumped by, and how often
-most
-of the satellites contradicted the state.
+"""Tight coupling: what is known of the clock, and counts.
+
+``clock_known``: whether bias and drift have values yet. ``clock_jumps``: milliseconds by which the clock has jumped.
+``range_faults``: how often most of the satellites contradicted the state.
 """
 
 MILLISECOND = 1e-3 * SPEED_OF_LIGHT
 """m; receiver clocks jump by whole milliseconds."""
 
 JUMP_TOLERANCE = 100.0
-"""m by which a jump of the clock may differ from whole milliseconds."""
+"""m; a jump of the clock may differ from whole milliseconds by this."""
 
 LOST_CLOCK = (0.1 * MILLISECOND, 1000.0)
-"""Beyond this uncertainty (m, m/s) the clock is taken from the satellites anew."""
+"""Standard deviation of bias (m) and drift (m/s) beyond which the clock is reset from the satellites."""
 
 
 @njit
 def reset_clock(state, which, shift, settings):
-    """Begin again with the bias (``which`` 0, m) or the drift (1, m/s) of the clock, ``shift`` from where it was."""
+    """Reset the bias (``which`` 0, m) or the drift (1, m/s) of the clock to its value plus ``shift``."""
     place = settings.clock_at + which
     value = state.optional[place - ERROR_SIZE] + shift
     reset_augmented(state, place, 1, settings)
@@ -50,7 +51,7 @@ def reset_clock(state, which, shift, settings):
 
 @njit
 def reset_or_jump_clock(state, aids, first, end, which, settings, work):
-    """Give bias or drift a first value, and follow a jump by whole milliseconds."""
+    """Give bias or drift of the clock a first value, or let the bias jump by whole milliseconds."""
     if work.signal_count == 0:
         return
     common = median(work.signal_innovation, work.signal_count, work)
@@ -75,7 +76,7 @@ def reset_or_jump_clock(state, aids, first, end, which, settings, work):
 
 @njit
 def join_offsets(state, aids, first, end, settings):
-    """Take the clock into use, and the offsets of the constellations that are there."""
+    """Activate the clock states, and the offsets of the constellations in this epoch."""
     update_error_size(state, settings.clock_at + 2, settings)
     for i in range(first, end):
         place = offset_place(system_of(aids[i].source), settings)

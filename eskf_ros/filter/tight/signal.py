@@ -1,9 +1,9 @@
-"""What the aids of one signal have in common: its payload, the antenna, the line of sight.
+"""What pseudorange and range rate of a signal share: the payload, the antenna, the line of sight.
 
-Payload of a pseudorange and of a range rate alike: the measured value (m, m/s; satellite clock and group delay taken
-out), its standard deviation (NaN: by model), satellite position and velocity (ECEF at transmission, m, m/s), flags of
-`gnss.ranges`, carrier (Hz), C/N0 (dB-Hz, NaN unknown), noise factor, and for the atmosphere GPS time (s since 6 January
-1980) and the eight parameters of Klobuchar (NaN: none). The source names the signal.
+Payload of both: the measured value (m, m/s; satellite clock and group delay taken out), its standard deviation (NaN: by
+model), satellite position and velocity (ECEF at transmission, m, m/s), flags of `gnss.ranges`, carrier (Hz), C/N0
+(dB-Hz, NaN unknown), noise factor, and for the atmosphere GPS time (s since 6 January 1980) and the eight parameters of
+Klobuchar (NaN: none). The source names the signal.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ LETTER_OF = {int(gnss): letter for letter, gnss in LETTERS.items()}
 
 @njit
 def source_of(gnss_id, sv_id, signal):
-    """Return the number that names a signal among the sources of a stream."""
+    """Return the number that identifies a signal among the sources of a stream."""
     return (gnss_id * 256 + sv_id) * 256 + signal
 
 
@@ -47,7 +47,7 @@ def satellite_of(source):
 
 
 def name_of(source: int) -> str:
-    """Return the name of a signal as RINEX has it: constellation and satellite, band and attribute ("G07 1C")."""
+    """Return the RINEX name of a signal: constellation and satellite, band and attribute ("G07 1C")."""
     gnss_id, sv_id, signal = source >> 16, (source >> 8) & 255, source & 255
     letter = LETTER_OF.get(gnss_id, "?")
     code = SIGNALS[signal].code if signal < len(SIGNALS) else "?"
@@ -56,7 +56,7 @@ def name_of(source: int) -> str:
 
 @njit
 def system_of(source):
-    """Return which satellites share an offset in the receiver's clock (`gnss.signals.time_group`)."""
+    """Return the group of satellites that share an offset in the receiver's clock (`gnss.signals.time_group`)."""
     gnss_id, sv_id = satellite_of(source)
     return time_group(gnss_id, sv_id)
 
@@ -89,7 +89,10 @@ def antenna_ecef(state, settings):
 
 @njit
 def see(payload, position, velocity):
-    """Return unit vector to the satellite (ECEF), range (m), range rate (m/s) from an antenna with this motion."""
+    """Return unit vector to the satellite (ECEF), range (m) and range rate (m/s).
+
+    ``position`` (m) and ``velocity`` (m/s) are those of the antenna in ECEF.
+    """
     p, v = SATELLITE, SATELLITE_VELOCITY
     return line_of_sight(
         (payload[p], payload[p + 1], payload[p + 2]),
@@ -102,7 +105,7 @@ def see(payload, position, velocity):
 
 @njit
 def to_map(state, vector_ecef):
-    """Return a vector in map axes."""
+    """Return a vector of ECEF axes in map axes."""
     return rotate_back(state.frame.map_to_ecef, vector_ecef)
 
 
