@@ -1,10 +1,43 @@
 """Build of eskf_ros, for colcon (ament_python) and for plain pip alike."""
 
+import importlib.util
+import os
+import subprocess
+import sys
 from glob import glob
+from pathlib import Path
 
 from setuptools import find_packages, setup
+from setuptools.command.build_py import build_py
 
 package_name = "eskf_ros"
+
+
+class BuildWithMachineCode(build_py):
+    """Compiles the estimator for the processor it is built on, so that its first start finds machine code.
+
+    Without numba, on another processor later, or with ESKF_ROS_COMPILE=0 the first start compiles, in a minute.
+    """
+
+    def run(self):
+        super().run()
+        missing = [name for name in ("numba", "numpy", "scipy") if importlib.util.find_spec(name) is None]
+        if getattr(self, "editable_mode", False) or os.environ.get("ESKF_ROS_COMPILE") == "0":
+            return
+        if missing:
+            print(f"{package_name}: not compiled, {', '.join(missing)} missing here: the first start will do it")
+            return
+        library = Path(self.build_lib).resolve()
+        paths = os.pathsep.join(filter(None, [str(library), os.environ.get("PYTHONPATH")]))
+        environment = {
+            **os.environ,
+            "PYTHONPATH": paths,
+            "NUMBA_CACHE_DIR": str(library / package_name / "machine_code"),
+        }
+        command = [sys.executable, "-m", f"{package_name}.ros_node.main", "--compile"]
+        if subprocess.run(command, env=environment, cwd=library, check=False).returncode:
+            print(f"{package_name}: not compiled (see above): the first start will do it")
+
 
 setup(
     name=package_name,
@@ -14,6 +47,7 @@ setup(
     maintainer="eskf_ros maintainers",
     maintainer_email="maintainers@example.org",
     license="Apache-2.0",
+    cmdclass={"build_py": BuildWithMachineCode},
     packages=find_packages(include=[package_name, f"{package_name}.*"]),
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),

@@ -1,11 +1,14 @@
-"""The one decorator for compiled functions, and where their machine code is cached.
+"""The decorators of compiled functions, and where their machine code is kept.
 
 The kernels are plain Python that numba compiles. Without numba, or with ``NUMBA_DISABLE_JIT=1``, the same code
 runs uncompiled and keeps up with an IMU of about 100 Hz.
 
-numba notices a changed source file only for the function it compiles, not for what that function calls in other
-files. The cache folder therefore carries a digest of all files with kernels and of what they import: a new version
-never runs old code.
+The machine code of a module lies in a folder that carries a digest of this module and of all that it imports from the
+package: numba by itself notices a changed file only for the function that it compiles, not for what that function calls
+or which constants it takes from other files. So a new version never runs old code, and an edit costs the compiling of
+the modules that depend on it. The folder does not depend on where the package lies: what a build has compiled
+(`setup.py`, in ``eskf_ros/machine_code``) is copied to the cache of the user, where numba finds it if the processor is
+the same.
 """
 
 from __future__ import annotations
@@ -39,55 +42,108 @@ PROGRESS_PERIOD = 5.0
 USUAL_COUNT = 500
 """Functions, each type of arguments counted, that a first start compiles, about: for the estimate of progress only."""
 
-_KEPT_CACHES = 4
+KEPT_VERSIONS = 4
+"""Versions of the machine code of one module that are kept; several checkouts may be in use."""
 
-_IMPORT = re.compile(rb"^from eskf_ros\.([\w.]+) import", re.MULTILINE)
-"""An import within the package, in the one form it has here but for ``from eskf_ros import MODULE``."""
+BUILT = Path(__file__).parent / "machine_code"
+"""Machine code that was made when the package was built; not there in a checkout."""
+
+_IMPORT = re.compile(r"^from eskf_ros\.([\w.]+) import (\([^)]*\)|[^\n(]+)", re.MULTILINE)
+"""An import within the package, in the one form it has here."""
+
+_NAME = re.compile(r"\w+")
 
 
-def _sources_digest(package: Path) -> str:
-    """Return a digest of the files with kernels and of all that they import from ``package``, however indirectly.
+class Digests:
+    """Digests of the modules of a package, each with all that it imports from there, however indirectly."""
 
-    numba freezes the constants that a kernel takes from other files into its machine code.
-    """
-    texts = {source: source.read_bytes() for source in package.rglob("*.py")}
-    found: set[Path] = set()
-    waiting = [source for source, text in texts.items() if b"@njit" in text]
-    while waiting:
-        source = waiting.pop()
-        if source in found:
-            continue
-        found.add(source)
-        for name in _IMPORT.findall(texts[source]):
-            imported = package.joinpath(*name.decode().split("."))
-            waiting += [imported.with_suffix(".py")] if imported.with_suffix(".py") in texts else imported.glob("*.py")
-    digest = hashlib.sha256()
-    for source in sorted(found):
-        digest.update(source.relative_to(package).as_posix().encode())
-        digest.update(texts[source])
-    return digest.hexdigest()[:16]
+    def __init__(self, package: Path) -> None:
+        self._package = package
+        self._needed: dict[str, frozenset[str]] = {}
+        self._texts: dict[str, str] = {}
+
+    def _exists(self, module: str) -> bool:
+        return self._package.joinpath(*module.split(".")).with_suffix(".py").is_file()
+
+    def _imports(self, module: str) -> set[str]:
+        """Modules that a module imports itself."""
+        text = self._package.joinpath(*module.split(".")).with_suffix(".py").read_text(encoding="utf-8")
+        self._texts[module] = text
+        found = set()
+        for source, names in _IMPORT.findall(text):
+            if self._exists(source):
+                found.add(source)
+            found |= {f"{source}.{name}" for name in _NAME.findall(names) if self._exists(f"{source}.{name}")}
+        return found
+
+    def needed(self, module: str) -> frozenset[str]:
+        """The module and all that it needs."""
+        if module not in self._needed:
+            found: set[str] = set()
+            waiting = [module]
+            while waiting:
+                name = waiting.pop()
+                if name in self._needed:
+                    found |= self._needed[name]
+                elif name not in found:
+                    found.add(name)
+                    waiting += self._imports(name)
+            self._needed[module] = frozenset(found)
+        return self._needed[module]
+
+    def of_all(self) -> str:
+        """Digest of all modules of the package."""
+        sources = sorted(self._package.rglob("*.py"))
+        return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()[:16]
+
+    def of(self, module: str) -> str:
+        """Digest of a module (name below the package)."""
+        digest = hashlib.sha256()
+        for name in sorted(self.needed(module)):
+            digest.update(name.encode())
+            digest.update(self._texts[name].encode())
+        return digest.hexdigest()[:16]
 
 
 def _cache_folder() -> Path:
-    """Return a writable folder for this version's machine code, in the user's cache or else in the temporary folder."""
+    """Return a writable folder for machine code: in the user's cache, or else in the temporary folder."""
     user_cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    for parent in (user_cache / "eskf_ros", Path(tempfile.gettempdir()) / f"eskf_ros_{os.getuid()}"):
-        folder = parent / _sources_digest(Path(__file__).parent)
+    for folder in (user_cache / "eskf_ros", Path(tempfile.gettempdir()) / f"eskf_ros_{os.getuid()}"):
         try:
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 pass
         except OSError:
             continue
-        _prune(parent)
         return folder
     return Path(tempfile.mkdtemp(prefix="eskf_ros_"))
 
 
-def _prune(parent: Path) -> None:
-    """Remove the machine code of old versions, keeping the newest few (several checkouts may be in use)."""
-    folders = sorted((f for f in parent.iterdir() if f.is_dir()), key=lambda f: f.stat().st_mtime, reverse=True)
-    for folder in folders[_KEPT_CACHES:]:
+def _folder_of(module: str, digest: str) -> Path:
+    """Return the folder for the machine code of a module, with what the build has made in it."""
+    assert CACHE_FOLDER is not None
+    folder = CACHE_FOLDER / f"{module}.{digest}"
+    if not folder.is_dir():
+        _prune(module)
+        built = BUILT / folder.name
+        if built.is_dir() and built != folder:
+            # Under another name first: two processes may start at the same time.
+            copy = Path(tempfile.mkdtemp(dir=CACHE_FOLDER, prefix=".new_"))
+            shutil.copytree(built, copy, dirs_exist_ok=True)
+            try:
+                copy.rename(folder)
+            except OSError:
+                shutil.rmtree(copy, ignore_errors=True)
+        folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def _prune(module: str) -> None:
+    """Remove the machine code of old versions of a module."""
+    assert CACHE_FOLDER is not None
+    folders = [f for f in CACHE_FOLDER.glob(f"{module}.*") if f.name.rpartition(".")[0] == module]
+    folders.sort(key=lambda folder: folder.stat().st_mtime, reverse=True)
+    for folder in folders[KEPT_VERSIONS - 1 :]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -139,7 +195,9 @@ def _with_few_types(dispatcher: Any) -> Any:
     numba compiles a function anew for each constant argument, each enumeration and each width of integer. These differ
     in nothing that a kernel does, so that the compiled functions are fewer by a tenth.
     """
-    from numba.core import types
+    from numba.core import types as numba_types
+
+    types: Any = numba_types
 
     def common(kind: Any) -> Any:
         kind = types.unliteral(kind)
@@ -155,19 +213,51 @@ def _with_few_types(dispatcher: Any) -> Any:
 
 
 if COMPILED:
-    CACHE_FOLDER: Path | None = None if numba.config.CACHE_DIR else _cache_folder()
+    from numba.core import caching
+
+    CACHE_FOLDER: Path | None = Path(numba.config.CACHE_DIR) if numba.config.CACHE_DIR else _cache_folder()
+    _DIGESTS = Digests(Path(__file__).parent)
+
+    class _Locator(caching._CacheLocator):  # type: ignore[misc]
+        """Tells numba where the machine code of a function of this package is."""
+
+        def __init__(self, function: Callable[..., Any], file: str) -> None:
+            package, _, module = function.__module__.partition(".")
+            self._line = function.__code__.co_firstlineno
+            if package == "eskf_ros" and module:
+                self._stamp = ""  # The name of the folder says which source it is.
+                self._folder = _folder_of(module, _DIGESTS.of(module))
+            else:
+                # A kernel of a test or of somebody else, which may call any of ours.
+                self._stamp = f"{os.stat(file).st_mtime_ns} {_DIGESTS.of_all()}"
+                self._folder = _folder_of(function.__module__, "outside")
+
+        @classmethod
+        def from_function(cls, py_func: Callable[..., Any], py_file: str) -> _Locator:
+            return cls(py_func, py_file)
+
+        def get_cache_path(self) -> str:
+            return str(self._folder)
+
+        def get_source_stamp(self) -> str:
+            return self._stamp
+
+        def get_disambiguator(self) -> str:
+            return str(self._line)
+
+    class _Implementation(caching.CompileResultCacheImpl):  # type: ignore[misc]
+        _locator_classes = (_Locator,)
+
+    class _Cache(caching.FunctionCache):  # type: ignore[misc]
+        _impl_class = _Implementation
 
     def _compiled(function: Function, **options: Any) -> Function:
-        previous = numba.config.CACHE_DIR
-        if CACHE_FOLDER is not None:
-            numba.config.CACHE_DIR = str(CACHE_FOLDER)
-        try:
-            # No fast math: fused operations round differently wherever the compiler inlines differently, and two
-            # processes would no longer agree to the bit.
-            dispatcher: Function = _with_few_types(numba.njit(cache=True, error_model="numpy", **options)(function))
-            return dispatcher
-        finally:
-            numba.config.CACHE_DIR = previous
+        # No fast math: fused operations round differently wherever the compiler inlines differently, and two
+        # processes would no longer agree to the bit.
+        dispatcher = numba.njit(error_model="numpy", **options)(function)
+        dispatcher._cache = _Cache(function)
+        compiled: Function = _with_few_types(dispatcher)
+        return compiled
 
     def njit(function: Function) -> Function:
         """Compile ``function`` on first use and cache the machine code (``NUMBA_CACHE_DIR`` is respected)."""

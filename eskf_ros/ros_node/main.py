@@ -18,7 +18,8 @@ config/eskf.yaml lists every parameter.
        eskf_node --compile
 
 Compile the estimator for this processor and end: the next start, of this user, takes a second instead of a minute
-(for the build of an image; needs no ROS). NUMBA_CACHE_DIR says where the machine code is kept.
+(for the build of an image; needs no ROS). NUMBA_CACHE_DIR says where the machine code is kept. colcon build and
+pip install from source do it by themselves.
 """
 
 

@@ -22,7 +22,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import eskf_ros
-from eskf_ros.compiled import COMPILED, _sources_digest, sentence_on_compiling
+from eskf_ros.compiled import COMPILED, Digests, sentence_on_compiling
 from eskf_ros.filter.output.global_odometry import ODOMETRY
 from eskf_ros.filter.state.memory import allocate
 from eskf_ros.parameters.docs import to_yaml
@@ -867,24 +867,28 @@ def test_compiling_is_told_and_loading_from_the_cache_is_not(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("file", "is_compiled_anew"),
+    ("file", "kernels", "is_compiled_anew"),
     [
-        ("filter/measurements/kalman_update.py", True),  # has kernels
-        ("filter/state/error_state.py", True),  # has none, but kernels take its constants
-        ("ros_node/two_d.py", True),
-        ("replay/main.py", False),
-        ("api.py", False),
+        ("filter/measurements/kalman_update.py", "filter.fuse", True),  # it calls them
+        ("filter/measurements/kalman_update.py", "filter.measurements.zupt", False),
+        ("filter/measurements/zupt.py", "filter.fuse", True),
+        ("filter/measurements/zupt.py", "filter.predict", False),
+        ("filter/state/error_state.py", "filter.inertial.covariance", True),  # it has none, but they take its constants
+        ("filter/tight/epoch.py", "filter.loop", True),
+        ("filter/tight/epoch.py", "filter.integrity.recovery", False),
+        ("ros_node/two_d.py", "ros_node.odometry", True),
+        ("ros_node/two_d.py", "filter.loop", False),
+        ("parameters/tree.py", "filter.loop", False),
+        ("replay/main.py", "filter.loop", False),
     ],
 )
-def test_machine_code_is_that_of_the_kernels_and_of_what_they_import(
-    tmp_path: Path, file: str, is_compiled_anew: bool
-) -> None:
+def test_an_edit_recompiles_what_depends_on_it(tmp_path: Path, file: str, kernels: str, is_compiled_anew: bool) -> None:
     package = tmp_path / "eskf_ros"
     shutil.copytree(Path(eskf_ros.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
-    before = _sources_digest(package)
-    assert before == _sources_digest(Path(eskf_ros.__file__).parent)
+    before = Digests(package).of(kernels)
+    assert before == Digests(Path(eskf_ros.__file__).parent).of(kernels)
     (package / file).write_text((package / file).read_text(encoding="utf-8") + "\nANOTHER = 1\n", encoding="utf-8")
-    assert (_sources_digest(package) != before) == is_compiled_anew
+    assert (Digests(package).of(kernels) != before) == is_compiled_anew
 
 
 def test_compiling_says_so_at_once_and_then_seldom() -> None:
