@@ -86,7 +86,8 @@ def offer(state, aid, heading_before, settings, work):
     gate = gate_of(state, aid, size, settings)
     aid.verdict, aid.nis = update(state, size, gate, work)
     recover(state, aid, size, gate, settings, work)
-    watch_aid(state, aid, size, gate, work, settings)
+    if aid.verdict != Verdict.BAD_COVARIANCE:
+        watch_aid(state, aid, size, gate, work, settings)
     if aid.verdict == Verdict.FUSED and state.heading_known == 0:
         search_heading(state, aid, gate, settings, work)
     if aid.stream == Stream.GNSS_POSITION:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ _RosLoader.add_implicit_resolver(
 )
 
 
-def load(path: Path, node_name: str = "eskf_node") -> Parameters:
+def load(path: str | PathLike[str], node_name: str = "eskf_node") -> Parameters:
     """Return the parameters of a ROS 2 parameter file.
 
     Sections apply as in ROS: `/**`, `/*`, `eskf_node`, `/robot/eskf_node`, or nested namespaces; sections of other
@@ -43,6 +44,7 @@ def load(path: Path, node_name: str = "eskf_node") -> Parameters:
     Raises ParameterError (naming the file and every mistake in it) for a file that cannot be read, is no YAML, has no
     section for this node, or fails `from_mapping`.
     """
+    path = Path(path)
     source = str(path)
     try:
         document = yaml.load(path.read_text(encoding="utf-8"), Loader=_RosLoader)

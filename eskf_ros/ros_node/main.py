@@ -60,11 +60,18 @@ def _compile() -> int:
     if not COMPILED:
         print("eskf_node: numba is missing or switched off: there is nothing to compile", file=sys.stderr)
         return 2
+    import numpy as np
+
+    from eskf_ros.geodesy.map_frame import to_geodetic
     from eskf_ros.parameters.tree import Parameters
+    from eskf_ros.replay.tum_writer import tum_text
     from eskf_ros.ros_node.warm_up import compile_node
 
     with while_compiling(sentence_on_compiling(say)):
         compile_node(Parameters(), with_ranges=True)
+        # The replay is another command of the same package.
+        tum_text(np.zeros(1, np.int64), np.zeros((1, 7)))
+        to_geodetic(np.zeros((1, 3)))
     say(f"compiled; the machine code is in {CACHE_FOLDER or os.environ.get('NUMBA_CACHE_DIR')}")
     return 0
 

@@ -12,8 +12,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from eskf_ros.filter.fuse import fuse
+from eskf_ros.filter.history.records import AID
 from eskf_ros.filter.measurements.kalman_update import invert_positive, update, update_nominal_state
 from eskf_ros.filter.state.enums import Stream, Verdict
+from eskf_ros.filter.state.memory import allocate
 from support.kernels import (
     USUAL_STDS,
     conditioned_eigenvalues,
@@ -217,3 +220,19 @@ def test_inverse(seed: int, size: int, decades: int) -> None:
     assert (inverse == inverse.T).all()
     condition = np.linalg.cond(matrix)
     np.testing.assert_allclose(inverse @ matrix, np.eye(size), rtol=0.0, atol=1e-14 * condition)
+
+
+def test_without_an_innovation_covariance_the_monitors_learn_nothing() -> None:
+    """A negative variance makes it indefinite; half inverted it must not enter the sums of the receiver's faults."""
+    settings, state, aids = make_settings(), random_state(1, 0.0), allocate(AID)
+    state["covariance"][:15, :15] = np.diag(np.repeat([-1e6, 1.0, 1e-4, 1e-2, 1e-6], 3))
+    aid = aids[0]
+    aid["stream"], aid["stamp"], aid["verdict"] = Stream.GNSS_POSITION, state["stamp"], Verdict.WAITING
+    aid["payload"][:3] = (0.84, 0.2, 565.0)
+    aid["payload"][[3, 6, 8]] = 1.0
+    fuse(state, aids, 0, settings, make_work())
+    assert aid["verdict"] == Verdict.BAD_COVARIANCE
+    assert np.isfinite(state["receiver"]["fault_information"]).all()
+    assert np.isfinite(state["receiver"]["fault_evidence"]).all()
+    assert np.isfinite(state["receiver"]["drift_sums"]).all()
+    assert not state["receiver"]["fault_information"].any()
