@@ -419,7 +419,7 @@ class Alignment:
     moving_start_after: float = parameter(
         3.0,
         "s",
-        "When no stillness was found for so long, the vehicle is taken to be moving and is levelled on the way.",
+        "When the vehicle was not found at rest for this time, it is taken to be moving and is levelled on the way.",
         minimum=0.1,
         maximum=600.0,
     )
@@ -540,7 +540,11 @@ class Output:
         "none",
     )
     rate_divisor: int = parameter(
-        1, "", "Odometry and transforms are published for every so many IMU samples.", minimum=1, maximum=1000
+        1,
+        "",
+        "Odometry and transforms are published for one IMU sample in this number of samples.",
+        minimum=1,
+        maximum=1000,
     )
     two_d: bool = parameter(
         False,

@@ -231,7 +231,7 @@ class Mag(Aid):
     error_distance: float = parameter(
         50.0,
         "m",
-        "Having travelled so far, or turned by one radian, the vehicle meets another such error.",
+        "After this distance, or a turn by one radian, the error by disturbances is another.",
         above=0.0,
         maximum=1.0e6,
     )

@@ -120,7 +120,8 @@ def linearize(state, payload, settings, work):
             work.jacobian[0, settings.wheel_scale_at] = speed
         acceleration = horizontal_acceleration(state, rotation, state.specific_force)
         slip = speed * (LASTING_SPEED_ERROR + settings.wheel.slip * acceleration)
-        work.noise[0, 0] = payload[3] + repeated(state, SLIP_TIME) * slip**2 + rate_variance * dot(lever, lever)
+        work.noise[0, 0] = payload[3] + repeated(state, SLIP_TIME) * slip**2
+        work.noise[0, 0] += scale**2 * rate_variance * dot(lever, lever)
         size = 1
     if payload[6] >= 0.0:
         work.innovation[size] = payload[1] - turn_rate
