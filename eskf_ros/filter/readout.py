@@ -10,9 +10,10 @@ from eskf_ros.filter.alignment.warm_start import Memory
 from eskf_ros.filter.history.arguments import copied
 from eskf_ros.filter.history.buffers import Buffers
 from eskf_ros.filter.history.records import RECORD
-from eskf_ros.filter.integrity.heading_monitor import complaints, is_heading_contradicted
+from eskf_ros.filter.integrity.heading_monitor import is_heading_contradicted
 from eskf_ros.filter.integrity.receiver_monitor import aid_complaints
 from eskf_ros.filter.integrity.recovery import phase_of
+from eskf_ros.filter.integrity.report import complaints
 from eskf_ros.filter.integrity.traffic import Traffic
 from eskf_ros.filter.layout import STATE
 from eskf_ros.filter.output.global_odometry import ODOMETRY, status_of, write_odometry

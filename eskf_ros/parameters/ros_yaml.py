@@ -26,7 +26,8 @@ class _RosLoader(yaml.SafeLoader):
                     None, None, f"{key_node.value} is given twice", key_node.start_mark
                 )
             seen.add(key_node.value)
-        return super().construct_mapping(node, deep)
+        mapping: dict[Any, Any] = super().construct_mapping(node, deep)
+        return mapping
 
 
 _RosLoader.add_implicit_resolver(

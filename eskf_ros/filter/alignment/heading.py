@@ -6,6 +6,7 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.heading_search import COSINE, begin_search, spread, turn_found, update_search
+from eskf_ros.filter.history.records import XX, YY, ZZ
 from eskf_ros.filter.inertial.covariance import update_error_axes
 from eskf_ros.filter.inertial.navigation_frame import (
     body_rate,
@@ -164,7 +165,7 @@ def reset_heading_from_memory(state, payload, settings):
     fix = geodetic_to_ecef(payload[0], payload[1], payload[2])
     place, lever, mount = settings.remembered_place_ecef, settings.lever_arms_body[0], settings.imu_position_base
     way = (fix[0] - place[0], fix[1] - place[1], fix[2] - place[2])
-    fix_std = math.sqrt(max(payload[3], payload[6], payload[8]))
+    fix_std = math.sqrt(max(payload[XX], payload[YY], payload[ZZ]))
     # The antenna is at most this far from base_link, on whatever side.
     reach = math.sqrt(dot(lever, lever)) + math.sqrt(dot(mount, mount))
     std = math.sqrt(fix_std**2 + settings.remembered_place_std**2)

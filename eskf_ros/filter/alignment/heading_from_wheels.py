@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.heading import search_with
+from eskf_ros.filter.history.records import XX
 from eskf_ros.filter.inertial.navigation_frame import body_rate
 from eskf_ros.filter.measurements.jacobians import vehicle_axes
 from eskf_ros.filter.measurements.wheel import repeated
@@ -27,18 +28,23 @@ def search_with_wheels(state, payload, gate, settings, work):
     The measurement: the velocity of the IMU on the map, minus the velocity of the wheels turned by the unknown heading,
     is zero. Its noise contains the angle between course and heading (``settings.course_std``).
     """
-    if state.heading_known == 1 or state.search.started == 0 or settings.use_course == 0 or payload[3] < 0.0:
+    if state.heading_known == 1 or state.search.started == 0 or settings.use_course == 0 or payload[XX] < 0.0:
         return
     if abs(payload[0]) < LEAST_SPEED:
         return
     rotation = to_matrix(state.attitude)
     forward, _left, _up = vehicle_axes(state, settings)
-    sway = cross(body_rate(state, rotation), settings.wheel.arm_body)
+    lever_velocity = cross(body_rate(state, rotation), settings.wheel.arm_body)
     speed = payload[0]
     motion = rotate(
-        rotation, (speed * forward[0] - sway[0], speed * forward[1] - sway[1], speed * forward[2] - sway[2])
+        rotation,
+        (
+            speed * forward[0] - lever_velocity[0],
+            speed * forward[1] - lever_velocity[1],
+            speed * forward[2] - lever_velocity[2],
+        ),
     )
-    variance = payload[3] + repeated(state, SIDE_SLIP_TIME) * (settings.course_std * speed) ** 2
+    variance = payload[XX] + repeated(state, SIDE_SLIP_TIME) * (settings.course_std * speed) ** 2
     for i in range(3):
         for j in range(3):
             work.noise[i, j] = 0.0

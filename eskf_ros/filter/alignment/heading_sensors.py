@@ -15,6 +15,7 @@ from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.first_fix import START_VELOCITY_STD
 from eskf_ros.filter.alignment.heading import reset_heading
 from eskf_ros.filter.alignment.heading_search import turn_found
+from eskf_ros.filter.history.records import XX
 from eskf_ros.filter.inertial.navigation_frame import heading_of
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ERROR_SIZE, GYRO_BIAS, VELOCITY
@@ -44,9 +45,9 @@ CANDIDATE = np.dtype(
 - ``disputed``: whether the dual antenna contradicts that heading.
 """
 
-DUAL_ANTENNA = 0
-MAGNETOMETER = 1
-IMU_ORIENTATION = 2
+RANK_DUAL_ANTENNA = 0
+RANK_MAGNETOMETER = 1
+RANK_IMU_ORIENTATION = 2
 
 MESSAGES = 3
 """Messages in a row, at least, that must agree before the heading is set."""
@@ -79,17 +80,17 @@ def update_unknown_heading(state, aid, settings, work):
 
     Returns whether the heading was set; then the measurement is still to be fused.
     """
-    if aid.payload[3] < 0.0:
+    if aid.payload[XX] < 0.0:
         return False
-    rank = MAGNETOMETER
+    rank = RANK_MAGNETOMETER
     if aid.stream == Stream.HEADING:
-        rank = DUAL_ANTENNA if aid.source == 0 else IMU_ORIENTATION
-    if rank == DUAL_ANTENNA and state.heading.disputed == 1:
+        rank = RANK_DUAL_ANTENNA if aid.source == 0 else RANK_IMU_ORIENTATION
+    if rank == RANK_DUAL_ANTENNA and state.heading.disputed == 1:
         return False
     turn, std = work.innovation[0], math.sqrt(work.noise[0, 0])
-    if rank == DUAL_ANTENNA and settings.heading_offset_at < state.error_size:
+    if rank == RANK_DUAL_ANTENNA and settings.heading_offset_at < state.error_size:
         std = math.hypot(std, settings.optional_std[settings.heading_offset_at - ERROR_SIZE])
-    if rank == MAGNETOMETER:
+    if rank == RANK_MAGNETOMETER:
         std = math.hypot(std, settings.optional_std[settings.mag_error_at - ERROR_SIZE])
     if std > LARGEST_STD or not update_heading_candidate(state, aid.stamp, rank, turn, std, SHORTEST_TIME[rank]):
         return False
@@ -137,10 +138,10 @@ def update_refutation(state, aid, settings, work):
         state.heading.given_stamp != NEVER
         and state.streams.fused_stamp[Stream.HEADING.value, 0] < state.heading.given_stamp
     )
-    if not is_doubtful or aid.source != 0 or not aid.payload[3] > 0.0:
+    if not is_doubtful or aid.source != 0 or not aid.payload[XX] > 0.0:
         return False
-    std = math.sqrt(aid.payload[3])
-    if not update_heading_candidate(state, aid.stamp, DUAL_ANTENNA, work.innovation[0], std, REFUTING_TIME):
+    std = math.sqrt(aid.payload[XX])
+    if not update_heading_candidate(state, aid.stamp, RANK_DUAL_ANTENNA, work.innovation[0], std, REFUTING_TIME):
         return False
     return (state.heading.candidate_since - state.heading.given_stamp) * 1e-9 < TRIAL_TIME
 
@@ -157,7 +158,7 @@ def reset_given_heading(state, aid, settings, work):
     if state.streams.fused_stamp[Stream.HEADING.value, 0] == NEVER:
         state.heading.disputed = 1
         return False
-    std = math.sqrt(aid.payload[3])
+    std = math.sqrt(aid.payload[XX])
     if settings.heading_offset_at < state.error_size:
         std = math.hypot(std, settings.optional_std[settings.heading_offset_at - ERROR_SIZE])
     reset_heading(state, heading_of(state, settings) + work.innovation[0], std, settings)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.history.records import XX, XY, XZ, YY, YZ, ZZ
 from eskf_ros.filter.state.enums import Verdict
 
 VARIANCES = (3, 6, 8)
@@ -28,32 +29,32 @@ def admit(offered, values, covariance, stand_in, scale, std_floor, may_lack_axes
         payload[i] = values[i]
     for i in range(3, len(payload)):
         payload[i] = 0.0
-    payload[3] = covariance[0]
-    payload[4] = covariance[1]
-    payload[5] = covariance[2]
-    payload[6] = covariance[4]
-    payload[7] = covariance[5]
-    payload[8] = covariance[8]
+    payload[XX] = covariance[0]
+    payload[XY] = covariance[1]
+    payload[XZ] = covariance[2]
+    payload[YY] = covariance[4]
+    payload[YZ] = covariance[5]
+    payload[ZZ] = covariance[8]
     if stand_in[0] > 0.0:
         for i in range(3, 9):
             payload[i] = 0.0
-        payload[3] = stand_in[0]
-        payload[6] = stand_in[1]
-        payload[8] = stand_in[2]
+        payload[XX] = stand_in[0]
+        payload[YY] = stand_in[1]
+        payload[ZZ] = stand_in[2]
     lacking = 0
     if may_lack_axes:
         lacking = take_out_absent_axes(payload)
     for i in range(9):
         if not math.isfinite(payload[i]):
             return Verdict.NON_FINITE
-    lowest = min(payload[3], payload[6], payload[8])
+    lowest = min(payload[XX], payload[YY], payload[ZZ])
     for i in range(3, 9):
         payload[i] *= scale
-    payload[3] = max(payload[3], std_floor[0] * std_floor[0])
-    payload[6] = max(payload[6], std_floor[1] * std_floor[1])
-    payload[8] = max(payload[8], std_floor[2] * std_floor[2])
-    xx, xy, xz = payload[3], payload[4], payload[5]
-    yy, yz, zz = payload[6], payload[7], payload[8]
+    payload[XX] = max(payload[XX], std_floor[0] * std_floor[0])
+    payload[YY] = max(payload[YY], std_floor[1] * std_floor[1])
+    payload[ZZ] = max(payload[ZZ], std_floor[2] * std_floor[2])
+    xx, xy, xz = payload[XX], payload[XY], payload[XZ]
+    yy, yz, zz = payload[YY], payload[YZ], payload[ZZ]
     determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
     for i in range(3):
         if lacking & (1 << i):
@@ -73,9 +74,9 @@ def take_out_absent_axes(payload):
             payload[i] = 0.0
             payload[VARIANCES[i]] = 0.0
     if lacking & 3:
-        payload[4] = 0.0
+        payload[XY] = 0.0
     if lacking & 5:
-        payload[5] = 0.0
+        payload[XZ] = 0.0
     if lacking & 6:
-        payload[7] = 0.0
+        payload[YZ] = 0.0
     return lacking

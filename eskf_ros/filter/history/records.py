@@ -8,6 +8,9 @@ IMU = np.dtype([("stamp", "i8"), ("specific_force", "f8", (3,)), ("angular_rate"
 
 PAYLOAD_SIZE = 25
 
+XX, XY, XZ, YY, YZ, ZZ = 3, 4, 5, 6, 7, 8
+"""Places of the upper triangle of the covariance in the payload, behind the three values."""
+
 AID = np.dtype(
     [
         ("stamp", "i8"),

@@ -11,10 +11,9 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.integrity.imu_monitor import BIASED_WINDOWS, FASTEST_TURN, GRAVITY_TOLERANCE
+from eskf_ros.filter.history.records import XX, YY
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.time import NEVER
-from eskf_ros.geodesy.earth import STANDARD_GRAVITY
 from eskf_ros.geodesy.rotation import wrapped
 
 HEADING_MONITOR = np.dtype(
@@ -47,16 +46,6 @@ ALIKE = 0.9
 FAR_OFF_DEG = 30.0
 """deg; smaller mean differences of headings are not reported."""
 
-LONG_REFUSED = 30.0
-"""s; velocities that are rejected for longer than this, while messages come, are reported."""
-
-REFUSED_CAUSES = {
-    Stream.WHEEL: "wheel.time_offset, wheel.position, the scale of the speed (estimate.wheel_scale), or slip",
-    Stream.BODY_VELOCITY: "body_velocity.mount_rpy_deg, body_velocity.mount_position, body_velocity.time_offset, or "
-    "covariances that claim too much",
-}
-"""What may be wrong with velocities that are rejected for `LONG_REFUSED`, by stream."""
-
 
 @njit
 def note_contrast(sums, angle):
@@ -69,7 +58,7 @@ def note_contrast(sums, angle):
 @njit
 def watch_heading(state, aid, work):
     """Compare a heading of the dual antenna or the magnetometer, described by ``work``, with the estimate."""
-    if aid.source == 0 and state.heading_known == 1 and aid.payload[3] > 0.0:
+    if aid.source == 0 and state.heading_known == 1 and aid.payload[XX] > 0.0:
         kind = 1 if aid.stream == Stream.MAG else 0
         note_contrast(state.heading_monitor.sensor_contrast[kind], work.innovation[0])
 
@@ -87,7 +76,7 @@ def watch_field(state, is_disturbed):
 def watch_course(state, aid, heading, settings):
     """Compare the course of a GNSS velocity with the heading (rad) of a vehicle that travels along its x axis."""
     east, north = aid.payload[0], aid.payload[1]
-    std = math.sqrt(max(aid.payload[3], aid.payload[6]))
+    std = math.sqrt(max(aid.payload[XX], aid.payload[YY]))
     fast = math.hypot(east, north) > max(settings.course_min_speed, 10.0 * std)
     if settings.use_course == 1 and state.heading_known == 1 and fast:
         note_contrast(state.heading_monitor.course_contrast, wrapped(math.atan2(north, east) - heading))
@@ -107,19 +96,7 @@ def is_heading_contradicted(state: np.void) -> bool:
     return any(_lasting_difference(sums) is not None for sums in state["heading_monitor"]["sensor_contrast"])
 
 
-def _refused_complaints(state: np.void) -> list[str]:
-    """Return one sentence for each velocity stream that has been rejected for `LONG_REFUSED`."""
-    found = []
-    for stream, causes in REFUSED_CAUSES.items():
-        count = int(state["streams"]["rejected"][stream, 0])
-        since = (int(state["stamp"]) - int(state["streams"]["fused_stamp"][stream, 0])) * 1e-9
-        last = (int(state["stamp"]) - int(state["streams"]["last_stamp"][stream, 0])) * 1e-9
-        if count > LASTING_COUNT and since > LONG_REFUSED > last:
-            found.append(f"{count} messages of {stream.name.lower()} in a row contradict the estimate: {causes}")
-    return found
-
-
-def _heading_complaints(state: np.void) -> list[str]:
+def heading_complaints(state: np.void) -> list[str]:
     found = []
     if state["heading_monitor"]["disturbed_fields"] > max(
         LASTING_COUNT, ALIKE * float(state["heading_monitor"]["field_count"])
@@ -160,33 +137,3 @@ def _heading_complaints(state: np.void) -> list[str]:
             "(If it is made to move like this: alignment.use_course false.)"
         )
     return found
-
-
-def complaints(state: np.void) -> list[str]:
-    """Return one sentence for each fault of IMU, headings and rejected velocities, with what to do."""
-    found = []
-    if state["imu_monitor"]["odd_gravity_windows"] > max(1, int(state["imu_monitor"]["windows"]) // 4):
-        strength = float(state["imu_monitor"]["odd_gravity"])
-        cause = "is its scale right?"
-        if strength < 0.05 * STANDARD_GRAVITY:
-            cause = "the driver removes gravity; publish the raw specific force (REP-145: +g up at rest)"
-        elif abs(strength - 1.0) < GRAVITY_TOLERANCE:
-            cause = "it is in units of g; REP-103 wants m/s2"
-        found.append(f"the accelerometer reads {strength:.2f} m/s2 where gravity is {STANDARD_GRAVITY:.2f}: {cause}")
-    if state["imu_monitor"]["biased_windows"] >= BIASED_WINDOWS:
-        x, y, z = np.degrees(state["imu_monitor"]["biased_rate"])
-        found.append(
-            f"at rest the gyro reads ({x:.2f}, {y:.2f}, {z:.2f}) deg/s, more than imu.gyro_bias_std allows for: raise "
-            "it, or calibrate the gyro"
-        )
-    if state["imu_monitor"]["tilted_windows"] > max(1, int(state["imu_monitor"]["rest_windows"]) // 4):
-        x, y, z = (float(value) for value in state["imu_monitor"]["tilted_force"])
-        found.append(
-            f"at rest gravity is ({x:.1f}, {y:.1f}, {z:.1f}) m/s2 in base_link, not along +z: imu.mount_rpy_deg does "
-            "not match the mounting, or the driver publishes North-East-Down axes"
-        )
-    if state["imu_monitor"]["fast_windows"] > 0:
-        found.append(
-            f"the gyro reads more than {FASTEST_TURN:.0f} rad/s for seconds: is it in deg/s? REP-103 wants rad/s"
-        )
-    return found + _heading_complaints(state) + _refused_complaints(state)

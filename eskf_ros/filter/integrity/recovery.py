@@ -27,6 +27,7 @@ import numpy as np
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.first_fix import START_VELOCITY_STD
 from eskf_ros.filter.alignment.heading_sensors import reset_given_heading, update_refutation
+from eskf_ros.filter.history.records import XX, YY
 from eskf_ros.filter.integrity.fix_tracker import is_contradicted, is_fusing, is_live, offset_of_track, patience
 from eskf_ros.filter.integrity.restart import reset_alignment
 from eskf_ros.filter.measurements.kalman_update import project, update
@@ -104,7 +105,7 @@ def reset_for_new_solution(state, aid, settings):
     """Reset the learnt scatter and the correlated error of fixes when the receiver changes its kind of solution."""
     if aid.stream != Stream.GNSS_POSITION:
         return
-    variance = aid.payload[3] + aid.payload[6]
+    variance = aid.payload[XX] + aid.payload[YY]
     last = state.window.last_fix_variance[aid.source]
     if max(variance, last) > SAME_SOLUTION * min(variance, last):
         state.tracker.scatter[aid.source] = 1.0

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.history.records import XX
 from eskf_ros.filter.measurements.jacobians import clear
 from eskf_ros.filter.measurements.row import (
     NEEDS_POSITION,
@@ -78,7 +79,7 @@ def linearize(state, payload, source, settings, work):
     work.innovation[0] = pressure_altitude(payload[0]) - predict(state, source, settings)
     # Height falls with pressure at the rate (T0 / L - altitude) EXPONENT / pressure.
     slope = (TEMPERATURE_HEIGHT - pressure_altitude(payload[0])) * EXPONENT / payload[0]
-    work.noise[0, 0] = slope**2 * payload[3]
+    work.noise[0, 0] = slope**2 * payload[XX]
 
     axes = east_north_up_to_ecef(latitude, longitude)
     up = rotate_back(state.frame.map_to_ecef, (axes[0][2], axes[1][2], axes[2][2]))

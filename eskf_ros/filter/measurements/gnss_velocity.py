@@ -26,8 +26,12 @@ SIZE = 3
 def predict(state, source, settings):
     """Return the velocity (m/s, map) of the antenna of receiver ``source``."""
     rotation = to_matrix(state.attitude)
-    sway = rotate(rotation, cross(body_rate(state, rotation), settings.lever_arms_body[source]))
-    return (state.velocity_map[0] + sway[0], state.velocity_map[1] + sway[1], state.velocity_map[2] + sway[2])
+    lever_velocity = rotate(rotation, cross(body_rate(state, rotation), settings.lever_arms_body[source]))
+    return (
+        state.velocity_map[0] + lever_velocity[0],
+        state.velocity_map[1] + lever_velocity[1],
+        state.velocity_map[2] + lever_velocity[2],
+    )
 
 
 @njit
@@ -45,7 +49,7 @@ def linearize(state, payload, source, settings, work):
     rotation = to_matrix(state.attitude)
     arm = settings.lever_arms_body[source]
     lever = rotate(rotation, arm)
-    sway = rotate(rotation, cross(body_rate(state, rotation), arm))
+    lever_velocity = rotate(rotation, cross(body_rate(state, rotation), arm))
     # The gyro reading of this instant carries the white noise of one sample.
     rate_variance = settings.gyro_noise_density**2 / state.imu.interval
     for i in range(3):
@@ -54,9 +58,9 @@ def linearize(state, payload, source, settings, work):
         work.noise[i, i] += rate_variance * dot(lever, lever)
     if state.heading_known == 0:
         for i in range(3):
-            work.noise[i, i] += dot(sway, sway)
+            work.noise[i, i] += dot(lever_velocity, lever_velocity)
         return SIZE
-    set_minus_cross(work.jacobian, ATTITUDE, sway)
+    set_minus_cross(work.jacobian, ATTITUDE, lever_velocity)
     # An attitude error also turns the Earth rate into the body: [lever]x [Earth rate]x theta.
     earth = state.frame.earth_rate_map
     along = dot(lever, earth)

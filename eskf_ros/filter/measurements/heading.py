@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.history.records import XX, XY, YY
 from eskf_ros.filter.inertial.navigation_frame import local_east_north_up_to_ecef
 from eskf_ros.filter.measurements.jacobians import azimuth_change, clear, set_attitude_row, to_local
 from eskf_ros.filter.measurements.row import (
@@ -71,22 +72,22 @@ def linearize(state, payload, source, settings, work):
     level = math.sqrt(level_square)
     predicted_yaw, predicted_pitch = predict(state, source, settings)
     size = 0
-    if payload[3] > 0.0:
+    if payload[XX] > 0.0:
         place = settings.heading_offset_at
         if source == 0 and place < state.error_size:
             yaw -= state.optional[place - ERROR_SIZE]
             work.jacobian[0, place] = 1.0
         work.innovation[0] = wrapped(yaw - predicted_yaw)
         set_attitude_row(work.jacobian, 0, state, local_to_ecef, azimuth_change(d, level_square))
-        work.noise[0, 0] = payload[3]
+        work.noise[0, 0] = payload[XX]
         size = 1
-    if payload[6] > 0.0:
+    if payload[YY] > 0.0:
         work.innovation[size] = payload[1] - predicted_pitch
         set_attitude_row(work.jacobian, size, state, local_to_ecef, (-d[1] / level, d[0] / level, 0.0))
         if size == 1:
-            work.noise[0, 1] = payload[4]
-            work.noise[1, 0] = payload[4]
-        work.noise[size, size] = payload[6]
+            work.noise[0, 1] = payload[XY]
+            work.noise[1, 0] = payload[XY]
+        work.noise[size, size] = payload[YY]
         size += 1
     return size
 

@@ -64,8 +64,8 @@ def point_velocity(state, rotation, rate, arm):
     R' v + rate x arm (Groves, section 14.3.1).
     """
     velocity = rotate_back(rotation, state.velocity_map)
-    sway = cross(rate, arm)
-    return (velocity[0] + sway[0], velocity[1] + sway[1], velocity[2] + sway[2])
+    lever_velocity = cross(rate, arm)
+    return (velocity[0] + lever_velocity[0], velocity[1] + lever_velocity[1], velocity[2] + lever_velocity[2])
 
 
 @njit

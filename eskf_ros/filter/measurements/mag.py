@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.history.records import XX, XY, XZ, YY, YZ, ZZ
 from eskf_ros.filter.inertial.navigation_frame import local_east_north_up_to_ecef
 from eskf_ros.filter.measurements.jacobians import clear, set_attitude_row, to_local
 from eskf_ros.filter.measurements.row import (
@@ -121,7 +122,7 @@ def linearize(state, payload, settings, work):
     change = (-north / level, east / level, 0.0)
     change = rotate_back(state.frame.map_to_ecef, rotate(local_to_ecef, change))
     change = rotate_back(settings.mag.sensor_to_imu, rotate_back(to_matrix(state.attitude), change))
-    xx, xy, xz, yy, yz, zz = payload[3], payload[4], payload[5], payload[6], payload[7], payload[8]
+    xx, xy, xz, yy, yz, zz = payload[XX], payload[XY], payload[XZ], payload[YY], payload[YZ], payload[ZZ]
     spread = rotate(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)), change)
     work.noise[0, 0] = dot(change, spread)
     if settings.magnetic_bias_at < state.error_size:

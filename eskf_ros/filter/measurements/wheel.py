@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.history.records import XX, XY, YY
 from eskf_ros.filter.inertial.navigation_frame import body_rate
 from eskf_ros.filter.measurements.jacobians import (
     clear,
@@ -111,7 +112,7 @@ def linearize(state, payload, settings, work):
     lever = cross(forward, arm)
 
     size = 0
-    if payload[3] >= 0.0:
+    if payload[XX] >= 0.0:
         work.innovation[0] = payload[0] - predicted_speed
         set_point_velocity_row(work.jacobian, 0, forward, scale, state, rotation, arm)
         sideways, upwards = dot(left, velocity), dot(up, velocity)
@@ -120,10 +121,10 @@ def linearize(state, payload, settings, work):
             work.jacobian[0, settings.wheel_scale_at] = speed
         acceleration = horizontal_acceleration(state, rotation, state.specific_force)
         slip = speed * (LASTING_SPEED_ERROR + settings.wheel.slip * acceleration)
-        work.noise[0, 0] = payload[3] + repeated(state, SLIP_TIME) * slip**2
+        work.noise[0, 0] = payload[XX] + repeated(state, SLIP_TIME) * slip**2
         work.noise[0, 0] += scale**2 * rate_variance * dot(lever, lever)
         size = 1
-    if payload[6] >= 0.0:
+    if payload[YY] >= 0.0:
         work.innovation[size] = payload[1] - turn_rate
         earth = cross(rotate(rotation, up), state.frame.earth_rate_map)
         for j in range(3):
@@ -131,10 +132,10 @@ def linearize(state, payload, settings, work):
             work.jacobian[size, GYRO_BIAS + j] = -up[j]
         set_mounting(work.jacobian, size, sine * dot(left, rate), dot(forward, rate), state, settings)
         lasting = (LASTING_TURN_ERROR * turn_rate) ** 2 + (UNEQUAL_WHEELS * speed) ** 2
-        work.noise[size, size] = payload[6] + repeated(state, TURN_ERROR_TIME) * lasting + rate_variance
+        work.noise[size, size] = payload[YY] + repeated(state, TURN_ERROR_TIME) * lasting + rate_variance
         if size == 1:
             # The noise of the gyro is in both predictions.
-            shared = payload[4] - scale * rate_variance * dot(lever, up)
+            shared = payload[XY] - scale * rate_variance * dot(lever, up)
             work.noise[0, 1] = shared
             work.noise[1, 0] = shared
         size += 1

@@ -121,8 +121,12 @@ def write_odometry(state, local, settings, row):
     imu_offset = rotate(base_to_map, settings.imu_position_base)
     rate_imu = body_rate(state, to_matrix(state.attitude))
     rate_base = rotate(settings.imu_to_base, rate_imu)
-    sway = rotate(base_to_map, cross(rate_base, settings.imu_position_base))
-    velocity = (state.velocity_map[0] - sway[0], state.velocity_map[1] - sway[1], state.velocity_map[2] - sway[2])
+    lever_velocity = rotate(base_to_map, cross(rate_base, settings.imu_position_base))
+    velocity = (
+        state.velocity_map[0] - lever_velocity[0],
+        state.velocity_map[1] - lever_velocity[1],
+        state.velocity_map[2] - lever_velocity[2],
+    )
     velocity_base = rotate_back(base_to_map, velocity)
     attitude = from_matrix(base_to_map)
 

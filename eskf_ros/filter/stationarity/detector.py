@@ -21,6 +21,7 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.history.records import XX, YY, ZZ
 from eskf_ros.filter.state.enums import CONSTRAINT_INTERVAL, Stream, Verdict
 from eskf_ros.filter.state.error_state import SOURCES, VELOCITY
 from eskf_ros.filter.state.time import NEVER
@@ -275,19 +276,19 @@ def update_rest_evidence(state, aid):
         note_displacement(state, aid)
     elif aid.stream == Stream.GNSS_VELOCITY:
         weigh_speed(
-            state, aid.stamp, math.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2), math.sqrt(max(p[3], p[6], p[8])), True
+            state, aid.stamp, math.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2), math.sqrt(max(p[XX], p[YY], p[ZZ])), True
         )
     elif aid.stream == Stream.BODY_VELOCITY:
-        speed, std = math.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2), math.sqrt(max(p[3], p[6], p[8]))
-        weigh_speed(state, aid.stamp, speed, std, min(p[3], p[6], p[8]) > 0.0)
+        speed, std = math.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2), math.sqrt(max(p[XX], p[YY], p[ZZ]))
+        weigh_speed(state, aid.stamp, speed, std, min(p[XX], p[YY], p[ZZ]) > 0.0)
         return update_motion(state, speed - REST_SIGMAS * std, aid.stamp, aid.stamp)
     elif aid.stream == Stream.WHEEL:
         if abs(p[0]) < STANDING_SPEED and abs(p[1]) < STANDING_YAW_RATE:
-            if p[3] > 0.0:
+            if p[XX] > 0.0:
                 state.rest.resting_stamp = aid.stamp
         else:
             state.rest.moving_stamp = aid.stamp
-            return update_motion(state, abs(p[0]) - REST_SIGMAS * math.sqrt(max(p[3], 0.0)), aid.stamp, aid.stamp)
+            return update_motion(state, abs(p[0]) - REST_SIGMAS * math.sqrt(max(p[XX], 0.0)), aid.stamp, aid.stamp)
     elif aid.stream == Stream.BARO:
         note_pressure(state, aid)
     return False
@@ -306,7 +307,7 @@ def weigh_speed(state, stamp, speed, std, is_whole):
 def note_displacement(state, aid):
     """Compare a fix with the one at which the IMU became quiet or, while it is not, with one a few seconds old."""
     fix = geodetic_to_ecef(aid.payload[0], aid.payload[1], aid.payload[2])
-    variance = max(aid.payload[3], aid.payload[6], aid.payload[8])
+    variance = max(aid.payload[XX], aid.payload[YY], aid.payload[ZZ])
     source = aid.source
     age = aid.stamp - state.rest.quiet_fix_stamp[source]
     if state.rest.quiet_fix_stamp[source] == NEVER or (state.rest.quiet == 0 and age > WAY_LASTS):
@@ -330,7 +331,7 @@ def note_pressure(state, aid):
     if state.rest.quiet == 0 or aid.stamp - state.rest.quiet_pressure_stamp > PRESSURE_LASTS:
         state.rest.quiet_pressure_stamp = aid.stamp
         state.rest.quiet_pressure = aid.payload[0]
-    elif abs(aid.payload[0] - state.rest.quiet_pressure) > DISPLACEMENT_SIGMAS * math.sqrt(2.0 * aid.payload[3]):
+    elif abs(aid.payload[0] - state.rest.quiet_pressure) > DISPLACEMENT_SIGMAS * math.sqrt(2.0 * aid.payload[XX]):
         state.rest.moving_stamp = aid.stamp
 
 

@@ -8,6 +8,7 @@ from enum import IntEnum
 import numpy as np
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.history.records import XX, YY, ZZ
 from eskf_ros.filter.inertial.navigation_frame import local_up
 from eskf_ros.filter.state.error_state import GYRO_BIAS, SOURCES
 from eskf_ros.filter.state.time import NEVER
@@ -139,7 +140,7 @@ def close_static_window(state):
 def update_evidence_from_fix(state, aid):
     """Keep a fix, and compare it with the anchor of the window; return whether the last level is disproved."""
     fix = geodetic_to_ecef(aid.payload[0], aid.payload[1], aid.payload[2])
-    std = math.sqrt(max(aid.payload[3], aid.payload[6], aid.payload[8]))
+    std = math.sqrt(max(aid.payload[XX], aid.payload[YY], aid.payload[ZZ]))
     return update_evidence_from_place(state, fix, std, aid.stamp, aid.source)
 
 
@@ -166,7 +167,7 @@ def update_evidence_from_place(state, ecef, std, stamp, source):
 def update_evidence_from_velocity(state, aid):
     """Look for motion in a GNSS velocity; return whether the last level is disproved (`update_motion`)."""
     speed = math.sqrt(aid.payload[0] ** 2 + aid.payload[1] ** 2 + aid.payload[2] ** 2)
-    std = math.sqrt(max(aid.payload[3], aid.payload[6], aid.payload[8]))
+    std = math.sqrt(max(aid.payload[XX], aid.payload[YY], aid.payload[ZZ]))
     return update_motion(state, speed - VELOCITY_SIGMAS * std, aid.stamp, aid.stamp)
 
 

@@ -76,7 +76,7 @@ def linearize(state, payload, settings, work):
     rotation = to_matrix(state.attitude)
     arm = settings.lever_arms_body[0]
     lever = rotate(rotation, arm)
-    sway = rotate(rotation, cross(body_rate(state, rotation), arm))
+    lever_velocity = rotate(rotation, cross(body_rate(state, rotation), arm))
     across = cross(unit, lever)
     # The gyro reading of this instant carries the white noise of one sample.
     gyro_variance = settings.gyro_noise_density**2 / state.imu.interval * dot(across, across)
@@ -86,11 +86,11 @@ def linearize(state, payload, settings, work):
         work.jacobian[0, VELOCITY + i] = -unit[i]
     work.jacobian[0, settings.clock_at + 1] = 1.0
     if state.heading_known == 0:
-        work.noise[0, 0] += dot(sway, sway)
+        work.noise[0, 0] += dot(lever_velocity, lever_velocity)
         return SIZE
     # An attitude error turns the velocity of the lever arm, and the Earth rate: [lever]x [Earth rate]x theta.
     earth = state.frame.earth_rate_map
-    swayed = cross(unit, sway)
+    swayed = cross(unit, lever_velocity)
     # It moves the antenna too, and so turns the line of sight.
     moved = cross(turning, lever)
     along, aligned = dot(unit, earth), dot(lever, earth)

@@ -80,9 +80,11 @@ def antenna_ecef(state, settings):
     arm = settings.lever_arms_body[0]
     p, v = state.position_map, state.velocity_map
     lever = rotate(rotation, arm)
-    sway = rotate(rotation, cross(body_rate(state, rotation), arm))
+    lever_velocity = rotate(rotation, cross(body_rate(state, rotation), arm))
     offset = rotate(state.frame.map_to_ecef, (p[0] + lever[0], p[1] + lever[1], p[2] + lever[2]))
-    velocity = rotate(state.frame.map_to_ecef, (v[0] + sway[0], v[1] + sway[1], v[2] + sway[2]))
+    velocity = rotate(
+        state.frame.map_to_ecef, (v[0] + lever_velocity[0], v[1] + lever_velocity[1], v[2] + lever_velocity[2])
+    )
     origin = state.frame.origin_ecef
     return (origin[0] + offset[0], origin[1] + offset[1], origin[2] + offset[2]), velocity
 
