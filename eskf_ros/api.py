@@ -282,7 +282,8 @@ class Filter:
         if name == "imu":
             return 0
         group = "gnss" if name in ("gnss_position", "gnss_velocity") else name
-        return int(round(getattr(self._parameters, group).time_offset * SECOND))
+        offset: float = getattr(self._parameters, group).time_offset
+        return round(offset * SECOND)
 
     def _note(self, name: str, table: Table, stamps: Stamps) -> None:
         """Remember the unused columns of a table and the span of its stamps, for warnings and errors."""
