@@ -45,17 +45,17 @@ class Buffers:
 
         An interval between two samples contains at most one grid point of the constraints.
         """
-        timeline = self.timeline[0]
+        timeline = self.timeline
         return (
-            int(timeline["imu_count"]) + IMU_BATCH,
-            int(timeline["aid_count"]) + 1 + aids + IMU_BATCH * constraints,
-            int(timeline["checkpoint_count"]) + IMU_BATCH // CHECKPOINT_SPACING + 2,
+            timeline["imu_count"][0] + IMU_BATCH,
+            timeline["aid_count"][0] + 1 + aids + IMU_BATCH * constraints,
+            timeline["checkpoint_count"][0] + IMU_BATCH // CHECKPOINT_SPACING + 2,
         )
 
     def have_room(self, aids: int, constraints: int) -> bool:
         """Say whether one batch of IMU samples and ``aids`` measurements fit in; ``constraints``: per grid point."""
-        wanted = self._wanted(aids, constraints)
-        return all(len(held) >= size for held, size in zip((self.imu, self.aids, self.checkpoints), wanted))
+        imu, offered, checkpoints = self._wanted(aids, constraints)
+        return len(self.imu) >= imu and len(self.aids) >= offered and len(self.checkpoints) >= checkpoints
 
     def forget(self, states: np.ndarray) -> None:
         """Drop what no accepted message can change any more; ``states``: the present state."""
