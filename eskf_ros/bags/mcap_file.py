@@ -4,6 +4,8 @@ A healthy recording ends with a summary: channels, counts and the position of ev
 (time, offset) pairs of its messages, so the messages of a topic are one strided gather from the decompressed chunk,
 without a Python statement per message. A file without a usable summary (cut off, damaged, or written without) is walked
 record by record once to build the same list of chunks, and so is a chunk without a message index.
+
+Over 400 lines: one file format, read in one pass.
 """
 
 from __future__ import annotations

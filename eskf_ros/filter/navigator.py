@@ -1,4 +1,7 @@
-"""The navigator: push sensor samples, get the state. The algorithm is `loop.advance`."""
+"""The navigator: push sensor samples, get the state. The algorithm is `loop.advance`.
+
+Over 400 lines: one class takes everything in; what can be read of it is in `readout.py`.
+"""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from eskf_ros.filter.history.arguments import copied
 from eskf_ros.filter.history.buffers import Buffers
 from eskf_ros.filter.history.records import RECORD
 from eskf_ros.filter.integrity.heading_monitor import is_heading_contradicted
-from eskf_ros.filter.integrity.receiver_monitor import aid_complaints
+from eskf_ros.filter.integrity.receiver_report import aid_complaints
 from eskf_ros.filter.integrity.recovery import phase_of
 from eskf_ros.filter.integrity.report import complaints
 from eskf_ros.filter.integrity.traffic import Traffic

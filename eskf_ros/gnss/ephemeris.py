@@ -4,6 +4,8 @@
 GLONASS), from any file or topic. All that depends on the kind of message is resolved there: times become GPS time,
 group delays and health become tables indexed by the slot of a signal (`eskf_ros.gnss.signals`), so that the kernels
 need no knowledge of messages.
+
+Over 400 lines: a record with its fields, limits and checks for each constellation.
 """
 
 from __future__ import annotations

@@ -82,6 +82,8 @@ def kepler_orbit(ephemeris, time):
     IS-GPS-200N, tables 20-IV and 30-II (the latter adds the rates of semi-major axis and mean motion, zero in LNAV);
     OS-SIS-ICD 2.1, section 5.1.1; BDS-SIS-ICD-B1I 3.0, section 5.2.4, with its own frame for geostationary satellites.
     The velocity is the analytic derivative, harmonics included.
+
+    Over 60 lines: the algorithm of the interface document, line by line.
     """
     gnss = ephemeris["gnss_id"]
     gravity = GRAVITY_GPS if gnss in (Gnss.GPS, Gnss.QZSS) else GRAVITY

@@ -3,6 +3,8 @@
 Unknowns: position, receiver clock, and the offset of each further constellation to the first (time scales, and delays
 in the receiver); velocity and clock drift from Doppler. Gauss-Newton with Huber's weights against many moderate errors,
 then data snooping against gross errors, both on residuals in units of their standard deviation.
+
+Over 400 lines: the solver with its outlier tests, and the settings and results that it is called with.
 """
 
 from __future__ import annotations
@@ -217,7 +219,10 @@ def _blank(ranges: NDArray[np.void]) -> PointSolution:
 
 
 def _solve_position(epoch: _Epoch, initial: Array | None, solution: PointSolution) -> None:
-    """Solve position and clock; write them and the status of each range to ``solution``."""
+    """Solve position and clock; write them and the status of each range to ``solution``.
+
+    Over 60 lines: one iteration with its outlier tests, whose parts share ten arrays.
+    """
     ranges, predictions, settings = epoch.ranges, epoch.predictions, epoch.settings
     groups = np.array([time_group(*satellite) for satellite in ranges[["gnss_id", "sv_id"]].tolist()])
     coded = ranges["flags"] & CODE_VALID != 0

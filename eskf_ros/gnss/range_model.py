@@ -141,6 +141,8 @@ def sight(
     ``observed``: a RANGE, or a record with its fields ``satellite``, ``satellite_velocity``, ``flags``, ``carrier_hz``,
     ``gnss_id``, ``sv_id``, ``cn0`` and ``noise_factor``. ``given_code_std`` m, ``given_doppler_std`` m/s: of the
     receiver, NaN for the model's.
+
+    Over 60 lines: the terms of one pseudorange in the order of the interface document.
     """
     satellite, satellite_velocity = observed["satellite"], observed["satellite_velocity"]
     unit, length, rate = line_of_sight(

@@ -6,6 +6,8 @@ is defined. `python -m eskf_ros.parameters` generates `config/eskf.yaml` and `do
 
 Values are Python floats, integers, bools, strings and tuples of floats. Angles whose name ends in `_deg` are degrees,
 all others are in the SI unit stated with them. Nothing here imports ROS.
+
+Over 400 lines: it is a table of parameters, and one place for all of them is easier to search than many.
 """
 
 from __future__ import annotations

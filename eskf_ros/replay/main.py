@@ -88,6 +88,10 @@ def _rate(text: str) -> float:
 
 
 def _parser() -> argparse.ArgumentParser:
+    """Open all that the node needs.
+
+    Over 60 lines: a list of options.
+    """
     parser = _Parser(
         prog="eskf_replay",
         description="Runs recordings of an IMU and a GNSS receiver through the estimator of eskf_node.",

@@ -82,6 +82,8 @@ def replay(
         BagError: the recording cannot be read, or a result cannot be written.
         InputError: the recording lacks a topic, or does not fit the options.
         OSError: the results cannot be written.
+
+    Over 60 lines: the loop of the replay with its results.
     """
     clock = StageClock(time.perf_counter() if started is None else started)
     parameters = with_options(parameters, options)

@@ -101,7 +101,10 @@ class RangeReceiver:
     def measure(
         self, section: Section, lever_arm: Vector, episodes: Sequence[Episode], seed: np.random.SeedSequence
     ) -> RangeMeasurements:
-        """Return the measurements in ``section`` with the antenna at ``lever_arm`` (m, base_link)."""
+        """Return the measurements in ``section`` with the antenna at ``lever_arm`` (m, base_link).
+
+        Over 60 lines: one epoch, satellite by satellite, with every error in the order in which it arises.
+        """
         clock_stream, noise, cn0_noise, atmosphere, orbits, offsets, happenings, delays = generators(seed, 8)
         geometry = _geometry(section, lever_arm, self.rate, self.systems, self.nav, self.clock_offset)
         ideal, satellites, stamp = geometry.ideal, geometry.satellites, geometry.stamp

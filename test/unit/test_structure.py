@@ -203,3 +203,14 @@ def test_functions_that_promise_to_look_do_not_write_the_state() -> None:
                 if any(ast.unparse(target).startswith("state.") for target in targets):
                     writers.append(f"{source.name}: {function.name}")
     assert not writers
+
+
+@pytest.mark.parametrize("source", SOURCES, ids=module_of)
+def test_long_files_and_functions_give_their_reason(source: Path) -> None:
+    text = source.read_text(encoding="utf-8")
+    tree = ast.parse(text)
+    if len(text.splitlines()) > 400:
+        assert "Over 400 lines: " in (ast.get_docstring(tree) or "")
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef) and (node.end_lineno or 0) - node.lineno + 1 > 60:
+            assert "Over 60 lines: " in (ast.get_docstring(node) or ""), node.name

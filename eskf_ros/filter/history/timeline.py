@@ -9,6 +9,8 @@ Constraints (rest, no side slip), which no sensor sends, are sorted among the me
 IMU samples are close together.
 
 A message is in time if its stamp is not older than the newest IMU stamp (the frontier) minus the window.
+
+Over 400 lines: total order, rewind and window are one invariant, and are read together.
 """
 
 from __future__ import annotations
