@@ -285,6 +285,8 @@ class Filter:
             return 0
         group = "gnss" if name in ("gnss_position", "gnss_velocity") else name
         offset: float = getattr(self._parameters, group).time_offset
+        if name == "gnss_velocity":
+            return round(offset * SECOND) + round(self._parameters.gnss.velocity_time_offset * SECOND)
         return round(offset * SECOND)
 
     def _note(self, name: str, table: Table, stamps: Stamps) -> None:

@@ -439,7 +439,10 @@ class Navigator(Readout):
         if uses_ranges and not is_second and not from_ranges:
             # The receiver solved this fix from the same ranges: both together would count twice.
             door = Verdict.DISABLED
-        self._push_aid(stream, stamp + round(receiver.time_offset * SECOND), arrival, int(is_second), door)
+        stamp = whole_stamp(stamp) + round(receiver.time_offset * SECOND)
+        if stream == Stream.GNSS_VELOCITY and not from_ranges:
+            stamp += round(self.parameters.gnss.velocity_time_offset * SECOND)
+        self._push_aid(stream, stamp, arrival, int(is_second), door)
 
     def _push_aid(self, stream: Stream, stamp: int, arrival: int, source: int, door: int) -> None:
         """Sort the record on offer into the timeline."""

@@ -174,8 +174,10 @@ def uses_ranges(parameters: Parameters) -> bool:
     return parameters.mode == "tight" or parameters.ranges.use_point_solution
 
 
-def time_offset_of(kind: Input, parameters: Parameters) -> float:
-    """Return the time offset (s) that is added to the stamps of an input."""
+def time_offset_of(kind: Input, parameters: Parameters, receiver: int = 0) -> float:
+    """Return the time offset (s) that is added to the stamps of an input, if it is one of a ``receiver`` of this."""
     group = "gnss" if kind.name in FIXES else "ranges" if kind.name in RANGES else kind.name
+    if receiver == 1 and kind.by_receiver:
+        group = "second_gnss"
     offset: float = getattr(parameters, group).time_offset
-    return offset
+    return offset + (parameters.gnss.velocity_time_offset if kind.stream == Stream.GNSS_VELOCITY else 0.0)

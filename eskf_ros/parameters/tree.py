@@ -240,6 +240,14 @@ class Gnss:
         minimum=-10.0,
         maximum=10.0,
     )
+    velocity_time_offset: float = parameter(
+        0.0,
+        "s",
+        "Added to the stamps of the velocities, of both receivers, besides time_offset. Negative when the receiver "
+        "filters its velocity, which is then older than the position of the same epoch.",
+        minimum=-10.0,
+        maximum=10.0,
+    )
     position_std_floor: float = parameter(
         0.02,
         "m",

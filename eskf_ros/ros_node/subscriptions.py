@@ -53,8 +53,7 @@ class AidInput:
 
     def configure(self, parameters: Parameters) -> None:
         """Use the time offsets of these parameters."""
-        offsets = (time_offset_of(self.kind, parameters), parameters.second_gnss.time_offset)
-        self._offsets = [round(offset * SECOND) for offset in offsets]
+        self._offsets = [round(time_offset_of(self.kind, parameters, receiver) * SECOND) for receiver in (0, 1)]
 
     def read(self, data: bytes, arrival: int) -> Batch:
         """Return one serialised message as a batch. Raises ValueError, or what rclpy raises, if it has another type."""

@@ -471,3 +471,21 @@ def test_a_stream_without_a_model_is_refused_with_a_record(recording: Recording)
     offer(state[0], aid[0], 0.0, navigator._settings[0], navigator._work[0])
     assert aid["verdict"][0] == Verdict.DISABLED
     assert np.array_equal(before, state["covariance"])
+
+
+def test_velocities_that_are_stamped_late_are_put_right(recording: Recording) -> None:
+    """With the parameter the filter gives, bit for bit, what it gives with right stamps; the positions stay."""
+    late = round(0.13e9)
+    rows = []
+    for delay, offset in ((0, 0.0), (late, -0.13)):
+        given = {**recording.parameters(), "gnss.velocity_time_offset": offset}
+        navigator = Navigator(from_mapping(given))
+        for k, stamp in enumerate(recording.fix_stamp.tolist()):
+            place = recording.fix_latitude_deg[k], recording.fix_longitude_deg[k], recording.fix_altitude[k]
+            navigator.push_gnss_position(stamp, *map(float, place), recording.fix_covariance[k], 2, 0)
+        for k, stamp in enumerate(recording.velocity_stamp.tolist()):
+            velocity, covariance = recording.velocity_enu[k], recording.velocity_covariance[k]
+            navigator.push_gnss_velocity(stamp + delay, velocity, covariance)
+        rows.append(navigator.push_imu(recording.imu_stamp, recording.specific_force, recording.angular_rate))
+    assert len(rows[0]) > 1000
+    assert rows[0].tobytes() == rows[1].tobytes()
