@@ -202,6 +202,8 @@ def _read_block(header: Header, index: int, kind: str, block: list[str], leap: i
     if len(orbit) < _SHORTEST.get(message, _SHORTEST_KEPLER):
         raise ValueError(f"{letter}{satellite} has {len(block)} lines only: cut off")
     fields = {name: value for name, value in zip(layout, orbit) if name is not None and not math.isnan(value)}
+    if any(map(math.isinf, (*clock_values, *fields.values()))):
+        raise ValueError(f"{letter}{satellite} has a number that is infinite")
     year, month, day, hour, minute, second = calendar(date)
     toc = from_calendar(year, month, day, hour, minute, second)
     if gnss == Gnss.GLONASS:

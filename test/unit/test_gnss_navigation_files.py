@@ -380,6 +380,8 @@ def damaged() -> list[tuple[str, str]]:
         (good.replace("2024 07 20", "2024 ?? 20", 1), "invalid literal"),
         ("\n".join(good.splitlines()[:4]) + "\n", "cut off"),
         (good.replace("E-01", "E!01", 1), "could not convert"),
+        # One changed byte can make an exponent of three digits.
+        (good.replace("E-01", "E999", 1), "infinite"),
     ]
 
 
