@@ -58,6 +58,8 @@ def fuse(state, aids, i, settings, work):
     if not open_record(aids, i):
         return
     aid = aids[i]
+    if aid.stream == Stream.GNSS_POSITION:
+        gnss_position.fill_altitude(state, aid.payload, aid.source, settings)
     update_motion_evidence(state, aid, settings)
     if aid.stream == Stream.GNSS_POSITION and state.level_known == 1 and state.position_known == 0:
         begin(state, aid, settings)

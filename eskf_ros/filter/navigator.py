@@ -30,6 +30,7 @@ from eskf_ros.filter.integrity.traffic import Traffic
 from eskf_ros.filter.layout import STATE, WORK, blank_state
 from eskf_ros.filter.loop import advance
 from eskf_ros.filter.measurements import heading, mag
+from eskf_ros.filter.measurements.gnss_position import NO_ALTITUDE, UNKNOWN_ALTITUDE_VARIANCE
 from eskf_ros.filter.measurements.heading import UNKNOWN_ANGLE_VARIANCE
 from eskf_ros.filter.output.global_odometry import ODOMETRY
 from eskf_ros.filter.output.local_odometry import LOCAL, note_jump
@@ -58,6 +59,9 @@ DIAGONAL = np.eye(3).ravel()
 
 
 NO_FIELD = (0.0, 0.0, 0.0, 0.0)
+
+HORIZONTAL = np.array([1, 1, 0, 1, 1, 0, 0, 0, 0], bool)
+"""The elements of a covariance (9,) that belong to the horizontal plane."""
 
 NO_STAND_IN = (0.0, 0.0, 0.0)
 """No stand-in: the covariance of a message is its own."""
@@ -229,9 +233,10 @@ class Navigator(Readout):
         """Take a position of the antenna: degrees, ellipsoidal metres, nine numbers East-North-Up (m2, row-major).
 
         ``covariance_type`` and ``status`` as in NavSatFix. An unknown or all-zero covariance is replaced by
-        ``gnss.status_std_horizontal`` and ``_vertical``. ``frame_id`` tells which antenna it is. ``from_ranges``: it
-        was solved here from the ranges of the first receiver (``ranges.use_point_solution``). ``arrival`` (ns) goes to
-        the record.
+        ``gnss.status_std_horizontal`` and ``_vertical``. An altitude that is NaN is not known: the fix is used
+        horizontally, and the height stays with the IMU and the barometer. ``frame_id`` tells which antenna it is.
+        ``from_ranges``: it was solved here from the ranges of the first receiver (``ranges.use_point_solution``).
+        ``arrival`` (ns) goes to the record.
 
         Raises:
             TypeError: the stamp is not an integer.
@@ -244,14 +249,24 @@ class Navigator(Readout):
             level = min(max(status, 0), 2)
             horizontal, vertical = gnss.status_std_horizontal[level] ** 2, gnss.status_std_vertical[level] ** 2
             stand_in = (horizontal, horizontal, vertical)
+        has_altitude = not math.isnan(altitude)
+        if not has_altitude:
+            altitude = 0.0
+            matrix = np.where(HORIZONTAL, matrix, 0.0)
+            matrix[8] = UNKNOWN_ALTITUDE_VARIANCE
+            if stand_in is not NO_STAND_IN:
+                stand_in = (stand_in[0], stand_in[1], UNKNOWN_ALTITUDE_VARIANCE)
         values = (math.radians(latitude_deg), math.radians(longitude_deg), float(altitude))
         door = self._admit(Stream.GNSS_POSITION, values, matrix, stand_in)
+        self._offered[0]["payload"][NO_ALTITUDE] = not has_altitude
         if door == Verdict.WAITING:
             if status < 0:
                 door = Verdict.NO_FIX
             elif abs(latitude_deg) > 90.0 or abs(longitude_deg) > 360.0 or abs(altitude) > HIGHEST_ALTITUDE:
                 door = Verdict.BAD_VALUE
-            elif self.needs_field:
+            else:
+                self._traffic.without_altitude += not has_altitude
+            if door == Verdict.WAITING and self.needs_field:
                 field = self._field_at(latitude_deg, longitude_deg, altitude, stamp)
                 self._offered[0]["payload"][mag.FIELD : mag.FIELD + 4] = field
         self._push_gnss(Stream.GNSS_POSITION, stamp, arrival, frame_id, from_ranges, door)

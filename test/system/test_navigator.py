@@ -489,3 +489,57 @@ def test_velocities_that_are_stamped_late_are_put_right(recording: Recording) ->
         rows.append(navigator.push_imu(recording.imu_stamp, recording.specific_force, recording.angular_rate))
     assert len(rows[0]) > 1000
     assert rows[0].tobytes() == rows[1].tobytes()
+
+
+@pytest.mark.parametrize("share", [1.0, 0.3])
+def test_fixes_without_altitude_are_used_horizontally(recording: Recording, share: float) -> None:
+    """Always or at times: the horizontal error stays, the vertical one is within what its sigma says."""
+    rng, errors = np.random.default_rng(5), []
+    for missing in (0.0, share):
+        navigator = Navigator(from_mapping({**recording.parameters(), "gnss.use_velocity": True}))
+        is_flat = rng.random(len(recording.fix_stamp)) < missing
+        for k, stamp in enumerate(recording.fix_stamp.tolist()):
+            altitude = np.nan if is_flat[k] else float(recording.fix_altitude[k])
+            place = float(recording.fix_latitude_deg[k]), float(recording.fix_longitude_deg[k]), altitude
+            navigator.push_gnss_position(stamp, *place, recording.fix_covariance[k], 2, 0)
+        for k, stamp in enumerate(recording.velocity_stamp.tolist()):
+            navigator.push_gnss_velocity(stamp, recording.velocity_enu[k], recording.velocity_covariance[k])
+        rows = navigator.push_imu(recording.imu_stamp, recording.specific_force, recording.angular_rate)
+        known = rows[rows["position_known"] & rows["heading_known"]]
+        truth = recording.truth_position_map[np.searchsorted(recording.truth_stamp, known["stamp"])]
+        error = known["position_map"] - truth
+        errors.append(float(np.sqrt(np.mean(error[:, :2] ** 2))))
+        records = navigator.finish()
+        fixes = records[records["stream"] == Stream.GNSS_POSITION]
+        assert (fixes["verdict"] == Verdict.FUSED).mean() > 0.9
+        assert (np.abs(error[:, 2]) < 4.0 * np.sqrt(known["pose_covariance"][:, 2, 2])).all()
+        assert bool(navigator.notes) == (missing > 0.0)
+    assert errors[1] < 1.2 * errors[0] + 0.02
+
+
+def test_fixes_without_altitude_in_any_order(recording: Recording) -> None:
+    """The stand-in altitude is a function of the state, so that late fixes give what punctual ones give."""
+    final = []
+    for is_late in (False, True):
+        navigator = Navigator(from_mapping({**recording.parameters(), "history.window": 60.0}))
+        # In parts of 4 s: fixes far ahead of the IMU would be refused.
+        for first in range(0, len(recording.imu_stamp), 400):
+            part = slice(first, first + 400)
+            stamps = recording.imu_stamp[part][0], recording.imu_stamp[part][-1] + 1
+            if is_late:
+                navigator.push_imu(
+                    recording.imu_stamp[part], recording.specific_force[part], recording.angular_rate[part]
+                )
+            for k, stamp in enumerate(recording.fix_stamp.tolist()):
+                if stamps[0] <= stamp < stamps[1]:
+                    place = float(recording.fix_latitude_deg[k]), float(recording.fix_longitude_deg[k]), math.nan
+                    navigator.push_gnss_position(stamp, *place, recording.fix_covariance[k], 2, 0)
+            if not is_late:
+                navigator.push_imu(
+                    recording.imu_stamp[part], recording.specific_force[part], recording.angular_rate[part]
+                )
+        navigator.update()
+        final.append(navigator.state[0])
+    assert final[0]["position_known"] == 1
+    for name in ("position_map", "velocity_map", "attitude", "covariance", "tracker", "rest"):
+        assert final[0][name].tobytes() == final[1][name].tobytes()

@@ -36,6 +36,8 @@ class Traffic:
     """Stamp of the last refused message minus that of the newest IMU sample (s)."""
     stand_ins: int = 0
     """Messages that came without a covariance."""
+    without_altitude: int = 0
+    """Fixes whose altitude is not a number."""
     field_problem: str = ""
     """Why the Earth's magnetic field is unknown; empty while it is not."""
 
@@ -69,10 +71,17 @@ class Traffic:
 
     def notes(self) -> list[str]:
         """Return one sentence for each fact worth knowing of the streams though nothing is wrong."""
+        found = []
+        if self.without_altitude:
+            found.append(
+                f"{self.without_altitude} fixes came without an altitude (NaN): they are used horizontally, and the "
+                "height is that of the IMU and, if there is one, of the barometer"
+            )
         if not self.stand_ins:
-            return []
+            return found
         return [
+            *found,
             f"{self.stand_ins} messages came without a covariance (unknown type or all zero): "
             "gnss.status_std_horizontal, gnss.status_std_vertical and the unknown_..._std of the parameters stand in "
-            "for it"
+            "for it",
         ]

@@ -1,7 +1,8 @@
 """GNSS position of the antenna.
 
 Payload: latitude, longitude (rad), ellipsoidal altitude (m), covariance in East-North-Up at the fix (m2: ee, en, eu,
-nn, nu, uu). Groves, section 14.3.1, for the local frame and a map-side attitude error.
+nn, nu, uu); a mark if the altitude is missing, which is then the filter's own with a wide variance. Groves, section
+14.3.1, for the local frame and a map-side attitude error.
 
 A share of the variance may belong to a correlated error: per axis it is the standard deviation of the fix, times the
 root of the share, times an augmented state of unit variance (first-order Gauss-Markov).
@@ -17,10 +18,16 @@ from eskf_ros.filter.measurements.jacobians import clear, set_east_north_up_cova
 from eskf_ros.filter.measurements.row import NEEDS_LEVEL, OptionalBlock, Row, threefold
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, POSITION
-from eskf_ros.geodesy.earth import east_north_up_to_ecef, geodetic_to_ecef
+from eskf_ros.geodesy.earth import east_north_up_to_ecef, ecef_to_geodetic, geodetic_to_ecef
 from eskf_ros.geodesy.rotation import rotate, rotate_back, to_matrix
 
 SIZE = 3
+
+NO_ALTITUDE = 9
+"""Place in the payload of the mark (1) of a fix without altitude."""
+
+UNKNOWN_ALTITUDE_VARIANCE = 1e8
+"""m2; of the altitude that stands in for one that is missing: 10 km, which tells the filter nothing."""
 
 NOTABLE_SCATTER = 2.0
 """Ratio of the scatter of fixes to the variance they claim above which their noise is inflated."""
@@ -43,6 +50,23 @@ def predict(state, source, settings):
     """Return the map position (m) of the antenna of receiver ``source``: position + R lever_arm."""
     lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[source])
     return (state.position_map[0] + lever[0], state.position_map[1] + lever[1], state.position_map[2] + lever[2])
+
+
+@njit
+def fill_altitude(state, payload, source, settings):
+    """Let the filter's own altitude (m) of the antenna stand in where a fix has none; its variance is wide anyway."""
+    if payload[NO_ALTITUDE] == 0.0:
+        return
+    if state.frame.datum_known == 0:
+        # Not what an earlier pass has left there: the result must not depend on the order of arrival.
+        payload[2] = 0.0
+        return
+    position = (0.0, 0.0, 0.0)
+    if state.position_known == 1:
+        position = predict(state, source, settings)
+    offset, origin = rotate(state.frame.map_to_ecef, position), state.frame.origin_ecef
+    geodetic = ecef_to_geodetic(origin[0] + offset[0], origin[1] + offset[1], origin[2] + offset[2])
+    payload[2] = geodetic[2]
 
 
 @njit
