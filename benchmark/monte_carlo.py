@@ -21,12 +21,13 @@ from scipy.stats import chi2
 
 from eskf_ros.filter.history.records import RECORD
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.filter.state.enums import STREAM_NAMES, Stream, Verdict
+from eskf_ros.filter.state.enums import STREAM_NAMES, Verdict
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, VELOCITY
 from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.parameters.tree import Parameters
 from eskf_ros.simulate.imu import ImuMount
 from eskf_ros.simulate.scenario import Recording, simulate
+from eskf_ros.tables.feeding import push_row, rows_from
 
 Array = NDArray[np.float64]
 
@@ -88,64 +89,41 @@ def feed(recording: Recording, navigator: Navigator, stops: NDArray[np.int64]) -
     The state at a stop has seen what had arrived by then. In between, messages are handed over in bulk: the order
     makes no difference to the state (principle of the timeline) but to the time it takes.
     """
-    fix = velocity = sample = 0
-    others = [wheel_messages(recording), body_velocity_messages(recording)]
-    given = [0] * len(others)
+    waiting, given, sample = messages_of(recording), 0, 0
     for i in stops:
         now = recording.imu_arrival[i]
-        for kind, messages in enumerate(others):
-            while given[kind] < len(messages) and messages[given[kind]][-1] <= now:
-                navigator.push(*messages[given[kind]])
-                given[kind] += 1
-        while fix < len(recording.fix_stamp) and recording.fix_arrival[fix] <= now:
-            navigator.push_gnss_position(
-                int(recording.fix_stamp[fix]),
-                float(recording.fix_latitude_deg[fix]),
-                float(recording.fix_longitude_deg[fix]),
-                float(recording.fix_altitude[fix]),
-                recording.fix_covariance[fix],
-                int(recording.fix_covariance_type[fix]),
-                int(recording.fix_status[fix]),
-                arrival=int(recording.fix_arrival[fix]),
-            )
-            fix += 1
-        while velocity < len(recording.velocity_stamp) and recording.velocity_arrival[velocity] <= now:
-            navigator.push_gnss_velocity(
-                int(recording.velocity_stamp[velocity]),
-                recording.velocity_enu[velocity],
-                recording.velocity_covariance[velocity],
-                int(recording.velocity_arrival[velocity]),
-            )
-            velocity += 1
+        while given < len(waiting) and waiting[given][0] <= now:
+            arrival, name, stamp, row = waiting[given]
+            push_row(navigator, name, stamp, row, arrival)
+            given += 1
         part = slice(sample, i + 1)
         navigator.push_imu(recording.imu_stamp[part], recording.specific_force[part], recording.angular_rate[part])
         sample = i + 1
         yield int(i), navigator.state[0]
 
 
-def wheel_messages(recording: Recording) -> list[tuple[Any, ...]]:
-    """Arguments of `Navigator.push` of all messages of the wheels; the last is the arrival."""
-    wheel = recording.wheel
-    if wheel is None:
-        return []
-    covariance = np.diag([wheel.speed_variance, wheel.yaw_rate_variance, -1.0]).ravel()
-    values = np.column_stack([wheel.speed, wheel.yaw_rate, np.zeros(len(wheel.speed))])
-    return [
-        (Stream.WHEEL, int(stamp), value, covariance, int(arrival))
-        for stamp, value, arrival in zip(wheel.stamp, values, wheel.arrival)
+def messages_of(recording: Recording) -> list[tuple[int, str, int, Array]]:
+    """Return (arrival, table, stamp, row) of all messages of GNSS, wheels and body velocity, as they come."""
+    places = np.column_stack([recording.fix_latitude_deg, recording.fix_longitude_deg, recording.fix_altitude])
+    fixes = rows_from(places, recording.fix_covariance, recording.fix_covariance_type, recording.fix_status)
+    velocities = rows_from(recording.velocity_enu, recording.velocity_covariance)
+    tables = [
+        ("gnss_position", recording.fix_stamp, recording.fix_arrival, fixes),
+        ("gnss_velocity", recording.velocity_stamp, recording.velocity_arrival, velocities),
     ]
-
-
-def body_velocity_messages(recording: Recording) -> list[tuple[Any, ...]]:
-    """The same of the sensor of body velocity."""
-    body = recording.body_velocity
-    if body is None:
-        return []
-    covariance = np.diag(body.variance).ravel()
-    return [
-        (Stream.BODY_VELOCITY, int(stamp), velocity, covariance, int(arrival))
-        for stamp, velocity, arrival in zip(body.stamp, body.velocity, body.arrival)
+    wheel, body = recording.wheel, recording.body_velocity
+    if wheel is not None:
+        covariance = np.diag([wheel.speed_variance, wheel.yaw_rate_variance, -1.0])
+        values = np.column_stack([wheel.speed, wheel.yaw_rate, np.zeros(len(wheel.speed))])
+        tables.append(("wheel", wheel.stamp, wheel.arrival, rows_from(values, covariance)))
+    if body is not None:
+        tables.append(("body_velocity", body.stamp, body.arrival, rows_from(body.velocity, np.diag(body.variance))))
+    found = [
+        (int(arrival), name, int(stamp), row)
+        for name, stamps, arrivals, rows in tables
+        for stamp, arrival, row in zip(stamps, arrivals, rows)
     ]
+    return sorted(found, key=lambda message: message[0])
 
 
 def state_error(recording: Recording, i: int, truth: int, state: np.void) -> Array:

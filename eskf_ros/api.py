@@ -51,6 +51,7 @@ from eskf_ros.parameters.ros_yaml import load
 from eskf_ros.parameters.tree import Parameters
 from eskf_ros.replay.summary import final_result
 from eskf_ros.tables.columns import Array, Stamps, Table, in_order
+from eskf_ros.tables.feeding import WIDTH, push_row
 from eskf_ros.tables.results import aid_summary, as_table, innovation_table, trajectory_table
 
 __all__ = ["Filter", "Result", "run"]
@@ -302,7 +303,7 @@ class Filter:
         kind, table = _KINDS[name], Table(name, source)
         stamps = table.stamps()
         count = len(stamps)
-        rows = np.zeros((count, 14))
+        rows = np.zeros((count, WIDTH))
         missing = kind.optional_column if kind.optional_column and not table.has(kind.optional_column) else ""
         if kind.is_vector:
             rows[:, :3] = table.vector(kind.columns[0], count)
@@ -336,7 +337,7 @@ class Filter:
         limit = max((stamp for stamp in (newest, self._newest) if stamp is not None), default=None)
         taken: list[tuple[int, str, int, Array]] = []
         for name, parts in self._aid_parts.items():
-            stamps, rows = in_order(parts, 14)
+            stamps, rows = in_order(parts, WIDTH)
             offset = self._offset(name)
             count = 0 if limit is None else int(np.searchsorted(stamps, limit - offset, "right"))
             taken += [(stamp + offset, name, stamp, row) for stamp, row in zip(stamps[:count].tolist(), rows[:count])]
@@ -351,13 +352,7 @@ class Filter:
             record = (stamp, stamp, _KINDS[name].stream, 0, Verdict.BEFORE_ALIGNMENT, 0, math.nan, (math.nan,) * 3)
             self._records.append(np.array([record], RECORD))
         for _, name, stamp, row in aids[dropped:]:
-            if name == "gnss_position":
-                position = float(row[0]), float(row[1]), float(row[2])
-                self._navigator.push_gnss_position(stamp, *position, row[3:12], int(row[12]), int(row[13]), stamp)
-            elif name == "gnss_velocity":
-                self._navigator.push_gnss_velocity(stamp, row[:3].tolist(), row[3:12], stamp)
-            else:
-                self._navigator.push(_KINDS[name].stream, stamp, row[:3].tolist(), row[3:12], stamp)
+            push_row(self._navigator, name, stamp, row, stamp)
 
     def _drops(self, summary: dict[str, Any]) -> list[str]:
         """Return one sentence for each input and reason for which rows of it were not used."""

@@ -19,7 +19,8 @@ from eskf_ros.simulate.episodes import MagneticDisturbance
 from eskf_ros.simulate.magnetometer import Magnetometer
 from eskf_ros.simulate.scenario import START_STAMP, simulate
 from eskf_ros.simulate.wheel import WheelOdometer
-from monte_carlo import body_velocity_messages, wheel_messages
+from eskf_ros.tables.feeding import STREAMS
+from monte_carlo import messages_of
 from support.aided import offers
 from support.kernels import copy_of
 
@@ -60,8 +61,9 @@ def test_arrival_order_changes_no_bit(case: str) -> None:
         parameters = {**parameters, "alignment.initial_heading_deg": math.degrees(2.0 * math.atan2(z, w))}
     settings = from_mapping({**recording.parameters(), "datum": [], **parameters})
     measured = offers(recording)
-    for stream_, stamp, values, covariance, arrival in (*wheel_messages(recording), *body_velocity_messages(recording)):
-        measured.append((stamp, stream_, values, covariance, arrival))
+    for arrival, name, stamp, row in messages_of(recording):
+        if name in ("wheel", "body_velocity"):
+            measured.append((stamp, STREAMS[name], row[:3], row[3:12], arrival))
 
     def result(seed: int, delays: tuple[float, float, float]) -> tuple[bytes, bytes]:
         random = np.random.default_rng(seed)
