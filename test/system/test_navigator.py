@@ -488,7 +488,9 @@ def test_velocities_that_are_stamped_late_are_put_right(recording: Recording) ->
             navigator.push_gnss_velocity(stamp + delay, velocity, covariance)
         rows.append(navigator.push_imu(recording.imu_stamp, recording.specific_force, recording.angular_rate))
     assert len(rows[0]) > 1000
-    assert rows[0].tobytes() == rows[1].tobytes()
+    # By field: the padding between them is nobody's.
+    for name in ODOMETRY.names or ():
+        np.testing.assert_array_equal(rows[0][name], rows[1][name])
 
 
 @pytest.mark.parametrize("share", [1.0, 0.3])
