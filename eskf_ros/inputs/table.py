@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.bags import POINT_CLOUD, Batch
-from eskf_ros.filter.measurements import gnss_position, gnss_velocity, wheel
-from eskf_ros.filter.measurements.row import Row, linear_covariances
+from eskf_ros.filter.measurements import gnss_position, gnss_velocity
+from eskf_ros.filter.measurements.row import TWIST, Row, linear_covariances
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.rows import SENSORS
 from eskf_ros.filter.state.enums import Stream
@@ -35,8 +35,6 @@ Converter = Callable[[Batch], Arguments]
 
 
 FIX = gnss_position.ROW.types[0]
-TWIST = gnss_velocity.ROW.types[0]
-ODOMETRY = wheel.ROW.types[0]
 
 
 @dataclass(frozen=True)

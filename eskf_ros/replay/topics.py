@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.bags import BagReader, Batch
+from eskf_ros.filter.measurements.row import ODOMETRY, TWIST
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.geodesy.map_frame import MapFrame
-from eskf_ros.inputs.table import FIX, ODOMETRY, RANGES, TWIST, Input, inputs_of, uses_ranges
+from eskf_ros.inputs.table import FIX, RANGES, Input, inputs_of, uses_ranges
 from eskf_ros.parameters.tree import Parameters, Topics
 from eskf_ros.replay.truth import epochs_from_fix, epochs_from_odometry
 

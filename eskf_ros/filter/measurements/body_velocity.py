@@ -17,7 +17,10 @@ from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import body_rate
 from eskf_ros.filter.measurements.jacobians import clear, gyro_noise_variance, point_velocity, set_point_velocity_row
 from eskf_ros.filter.measurements.row import (
+    BARE_TWIST,
     HIGHEST_SPEED,
+    ODOMETRY,
+    TWIST,
     Place,
     Readings,
     Row,
@@ -109,10 +112,6 @@ class BodyVelocity(Aid):
 
 SETTINGS = np.dtype([("arm_body", "f8", (3,)), ("axes_body", "f8", (3, 3))], align=True)
 """Lever arm of the sensor (m, IMU axes), and the axes of its velocity as rows (IMU axes)."""
-
-TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
-BARE_TWIST = "geometry_msgs/msg/TwistStamped"
-ODOMETRY = "nav_msgs/msg/Odometry"
 
 
 def read(messages: npt.NDArray[Any]) -> Readings:

@@ -14,7 +14,16 @@ import numpy.typing as npt
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import body_rate, local_east_north_up_to_ecef
 from eskf_ros.filter.measurements.jacobians import clear, set_east_north_up_covariance, set_identity, set_minus_cross
-from eskf_ros.filter.measurements.row import HIGHEST_SPEED, NEEDS_POSITION, Readings, Row, linear_covariances, threefold
+from eskf_ros.filter.measurements.row import (
+    BARE_TWIST,
+    HIGHEST_SPEED,
+    NEEDS_POSITION,
+    TWIST,
+    Readings,
+    Row,
+    linear_covariances,
+    threefold,
+)
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ATTITUDE, GYRO_BIAS, VELOCITY
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix
@@ -95,7 +104,7 @@ ROW = Row(
     Stream.GNSS_VELOCITY,
     "GNSS velocity",
     group_name="gnss",
-    types=("geometry_msgs/msg/TwistWithCovarianceStamped", "geometry_msgs/msg/TwistStamped"),
+    types=(TWIST, BARE_TWIST),
     read=read,
     limits=limits,
     depth=50,

@@ -27,6 +27,11 @@ Readings = tuple[FloatArray, FloatArray]
 HIGHEST_SPEED = 600.0
 """m/s; no sensor on a robot reports more."""
 
+TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
+BARE_TWIST = "geometry_msgs/msg/TwistStamped"
+ODOMETRY = "nav_msgs/msg/Odometry"
+"""Types of messages that carry a velocity."""
+
 UNMEASURED = -1.0
 """The variance of an axis that was not measured (REP-145 writes it for a quantity that is not there)."""
 

@@ -34,7 +34,10 @@ from eskf_ros.filter.measurements.jacobians import (
     vehicle_axes,
 )
 from eskf_ros.filter.measurements.row import (
+    BARE_TWIST,
     HIGHEST_SPEED,
+    ODOMETRY,
+    TWIST,
     UNMEASURED,
     OptionalBlock,
     Readings,
@@ -192,10 +195,6 @@ class Wheel(Aid):
 
 SETTINGS = np.dtype([("arm_body", "f8", (3,)), ("slip", "f8")], align=True)
 """Lever arm of the wheel point (m, IMU axes); slip as a share of the speed per m/s2."""
-
-TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
-BARE_TWIST = "geometry_msgs/msg/TwistStamped"
-ODOMETRY = "nav_msgs/msg/Odometry"
 
 
 def read(messages: npt.NDArray[Any]) -> Readings:
