@@ -10,10 +10,11 @@ from eskf_ros.filter.alignment.heading_sensors import update_unknown_heading
 from eskf_ros.filter.alignment.levelling import reset_level_to_moving
 from eskf_ros.filter.history.timeline import open_record
 from eskf_ros.filter.inertial.navigation_frame import heading_of
-from eskf_ros.filter.integrity.fix_tracker import update_track
 from eskf_ros.filter.integrity.heading_monitor import watch_course, watch_field, watch_heading
+from eskf_ros.filter.integrity.humble_lane import kind_of
+from eskf_ros.filter.integrity.receiver import fuse_receiver, reset_for_new_solution
 from eskf_ros.filter.integrity.receiver_monitor import watch_aid
-from eskf_ros.filter.integrity.recovery import gate_of, note, recover, reset_for_new_solution
+from eskf_ros.filter.integrity.recovery import note, recover
 from eskf_ros.filter.measurements import (
     baro,
     body_velocity,
@@ -31,6 +32,7 @@ from eskf_ros.filter.measurements.row import NEEDS_FIELD, NEEDS_HEADING, NEEDS_P
 from eskf_ros.filter.output.local_odometry import note_jump
 from eskf_ros.filter.state.augmented_states import update_error_size
 from eskf_ros.filter.state.enums import SENSOR_STREAMS, Stream, Verdict
+from eskf_ros.filter.state.lanes import FILTER
 from eskf_ros.filter.stationarity.detector import update_rest_evidence, watch_wheels
 from eskf_ros.filter.stationarity.static_window import update_evidence_from_fix, update_evidence_from_velocity
 
@@ -53,8 +55,9 @@ UNKNOWN_STREAM = -1
 
 
 @njit_in_caller
-def fuse(state, aids, i, settings, work):
+def fuse(states, aids, i, settings, work):
     """Fuse or refuse one measurement; write the verdict to its record."""
+    state = states[FILTER]
     if not open_record(aids, i):
         return
     aid = aids[i]
@@ -65,13 +68,14 @@ def fuse(state, aids, i, settings, work):
         begin(state, aid, settings)
     position_before = (state.position_map[0], state.position_map[1], state.position_map[2])
     heading_before = heading_of(state, settings)
-    offer(state, aid, heading_before, settings, work)
+    offer(states, aid, heading_before, settings, work)
     note_jump(state, position_before, heading_before, settings)
 
 
 @njit_in_caller
-def offer(state, aid, heading_before, settings, work):
+def offer(states, aid, heading_before, settings, work):
     """Fuse one measurement or refuse it; ``heading_before`` (rad) is the predicted heading."""
+    state = states[FILTER]
     if not is_aligned_for(state, settings.needs[aid.stream]):
         wait_for_alignment(state, aid, settings, work)
         return
@@ -80,14 +84,18 @@ def offer(state, aid, heading_before, settings, work):
         aid.verdict = Verdict.INACTIVE
         return
     update_error_size(state, settings.reach[aid.stream], settings)
-    reset_for_new_solution(state, aid, settings)
-    size = measure(state, aid, heading_before, settings, work)
-    if size == 0:
-        return
-    update_track(state, aid, work)
-    gate = gate_of(state, aid, size, settings)
-    aid.verdict, aid.nis = update(state, size, gate, work)
-    recover(state, aid, size, gate, settings, work)
+    gate = settings.gate[aid.stream, 3]
+    if kind_of(aid.stream) >= 0:
+        reset_for_new_solution(state, aid, settings)
+        fuse_receiver(states, aid, gate, settings, work)
+        size = aid.dof
+    else:
+        size = measure(state, aid, heading_before, settings, work)
+        if size == 0:
+            return
+        gate = settings.gate[aid.stream, size]
+        aid.verdict, aid.nis = update(state, size, gate, work)
+        recover(state, aid, settings, work)
     if aid.verdict != Verdict.BAD_COVARIANCE:
         watch_aid(state, aid, size, gate, work, settings)
     if aid.verdict == Verdict.FUSED and state.heading_known == 0:

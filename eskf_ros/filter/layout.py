@@ -17,9 +17,10 @@ from eskf_ros.filter.alignment.heading_sensors import CANDIDATE
 from eskf_ros.filter.alignment.levelling import LEVELLING
 from eskf_ros.filter.inertial.navigation_frame import FRAME
 from eskf_ros.filter.inertial.strapdown import IMU_READINGS
-from eskf_ros.filter.integrity.fix_tracker import FIX_TRACKER
 from eskf_ros.filter.integrity.heading_monitor import HEADING_MONITOR
+from eskf_ros.filter.integrity.humble_lane import TRUST
 from eskf_ros.filter.integrity.imu_monitor import IMU_MONITOR
+from eskf_ros.filter.integrity.receiver import SCATTER
 from eskf_ros.filter.integrity.receiver_monitor import RECEIVER_MONITOR
 from eskf_ros.filter.integrity.recovery import RECOVERY
 from eskf_ros.filter.measurements.mag import EARTH_FIELD
@@ -34,6 +35,7 @@ from eskf_ros.filter.state.error_state import (
     OPTIONAL_SIZES,
     SOURCES,
 )
+from eskf_ros.filter.state.lanes import LANES
 from eskf_ros.filter.state.memory import allocate
 from eskf_ros.filter.state.streams import STREAMS
 from eskf_ros.filter.state.time import NEVER
@@ -69,6 +71,8 @@ STATE = np.dtype(
         ("heading_known", "i8"),
         ("first_stamp", "i8"),
         ("restarts", "i8"),
+        # How much the IMU noise is widened, from 0 (as the parameters say) to 1 (as for the humble lane).
+        ("doubt", "f8"),
         # The records of the rooms.
         ("imu", IMU_READINGS),
         ("frame", FRAME),
@@ -82,11 +86,12 @@ STATE = np.dtype(
         ("imu_monitor", IMU_MONITOR),
         ("heading_monitor", HEADING_MONITOR),
         ("recovery", RECOVERY),
+        ("trust", TRUST),
         ("receiver", RECEIVER_MONITOR),
         ("mag", EARTH_FIELD),
         ("tight", TIGHT),
         ("streams", STREAMS),
-        ("tracker", FIX_TRACKER),
+        ("scatter", SCATTER),
     ],
     align=True,
 )
@@ -98,6 +103,8 @@ SETTINGS = np.dtype(
         ("accel_noise_density", "f8"),
         ("gyro_bias_random_walk", "f8"),
         ("accel_bias_random_walk", "f8"),
+        ("imu_noise", "f8", (4,)),
+        ("humble_noise", "f8", (4,)),
         ("gyro_bias_std", "f8"),
         ("accel_bias_std", "f8"),
         ("imu_gap", "f8"),
@@ -211,6 +218,7 @@ _NEVER = {
         "absolute_stamp",
         "reset_stamp",
     ),
+    "trust": ("doubt_stamp",),
     "mag": ("disturbed_stamp",),
     "heading": ("given_stamp",),
     "rest": (
@@ -227,7 +235,6 @@ _NEVER = {
         "fused_stamp",
         "fused_since",
     ),
-    "tracker": ("stamp",),
     "receiver": (
         "fault_stamp",
         "departure_stamp",
@@ -239,14 +246,14 @@ _NEVER = {
 
 
 def blank_state() -> np.ndarray:
-    """Return the state before the first IMU sample."""
-    state = allocate(STATE)
+    """Return the lanes (see `state.lanes`) before the first IMU sample."""
+    state = allocate(STATE, LANES)
     state["stamp"] = state["first_stamp"] = NEVER
     for room, fields in _NEVER.items():
         for field in fields:
             state[room][field] = NEVER
-    state["tracker"]["scatter"] = state["tracker"]["scatter_paid"] = 1.0
-    state["attitude"][0, 0] = 1.0
+    state["scatter"]["ratio"] = state["scatter"]["paid"] = 1.0
+    state["attitude"][:, 0] = 1.0
     state["levelling"]["kept_gyro_variance"] = np.inf
     state["error_size"] = ERROR_SIZE
     # Longer than any gap: the first interval is integrated without a curvature from an earlier one.

@@ -12,6 +12,7 @@ from eskf_ros.filter.integrity.restart import reset_alignment
 from eskf_ros.filter.output.global_odometry import write_odometry
 from eskf_ros.filter.output.local_odometry import carry, measure_step, note_jump
 from eskf_ros.filter.predict import propagate
+from eskf_ros.filter.state.lanes import FILTER, HUMBLE
 from eskf_ros.filter.state.time import NEVER, SECOND
 from eskf_ros.filter.stationarity.detector import add_to_block
 from eskf_ros.filter.stationarity.residual_motion import add_to_part
@@ -30,18 +31,19 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
     """
     t, settings, work, local = timeline[0], settings_[0], work_[0], locals_[0]
     rewind(states, checkpoints, t, blank)
-    state = states[0]
+    state = states[FILTER]
     row_count = 0
     while state.imu_next < t.imu_count:
         sample = imu[state.imu_next]
 
         while state.aid_next < t.aid_count and aids[state.aid_next].stamp < sample.stamp:
-            predict(state, aids[state.aid_next].stamp, sample, settings, work)
-            state.aid_next = fuse_next(state, aids, t.aid_count, settings, work)
+            predict(states, aids[state.aid_next].stamp, sample, settings, work)
+            state.aid_next = fuse_next(states, aids, t.aid_count, settings, work)
 
         previous_stamp = state.imu.stamp
-        predict(state, sample.stamp, sample, settings, work)
+        predict(states, sample.stamp, sample, settings, work)
         take_sample(state, sample)
+        states[HUMBLE].imu.interval = state.imu.interval
         measure_step(state, settings)
         update_rest(state, settings)
         add_to_block(state, settings)
@@ -52,7 +54,7 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
             carry(local, state, settings)
 
         while state.aid_next < t.aid_count and aids[state.aid_next].stamp == sample.stamp:
-            state.aid_next = fuse_next(state, aids, t.aid_count, settings, work)
+            state.aid_next = fuse_next(states, aids, t.aid_count, settings, work)
 
         if is_new and is_on_grid(previous_stamp, sample.stamp, settings.output_interval):
             write_odometry(state, local, settings, rows[row_count])
@@ -62,8 +64,9 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
 
 
 @njit
-def predict(state, stamp, sample, settings, work):
-    """Propagate the state to ``stamp`` (ns), at or before the next IMU sample; restart after a long silence."""
+def predict(states, stamp, sample, settings, work):
+    """Propagate the lanes to ``stamp`` (ns), at or before the next IMU sample; restart after a long silence."""
+    state = states[FILTER]
     if state.level_known == 0:
         return
     if sample.stamp - state.imu.stamp > LONGEST_GAP:
@@ -71,7 +74,7 @@ def predict(state, stamp, sample, settings, work):
         reset_alignment(state)
         note_jump(state, position, heading_of(state, settings), settings)
         return
-    propagate(state, stamp, sample, settings, work)
+    propagate(states, stamp, sample, settings, work)
 
 
 @njit
@@ -103,11 +106,12 @@ def take_sample(state, sample):
 
 
 @njit_in_caller
-def fuse_next(state, aids, count, settings, work):
+def fuse_next(states, aids, count, settings, work):
     """Fuse the next of ``count`` measurements, or all signals of its epoch; return the index of the next one."""
+    state = states[FILTER]
     i = state.aid_next
     if not is_range(aids[i].stream):
-        fuse(state, aids, i, settings, work)
+        fuse(states, aids, i, settings, work)
         return i + 1
     end = end_of_epoch(aids, i, count)
     fuse_ranges(state, aids, i, end, settings, work)

@@ -25,7 +25,6 @@ from eskf_ros.filter.history.timeline import (
     take_final,
 )
 from eskf_ros.filter.inertial.navigation_frame import heading_of, reset_datum, set_datum
-from eskf_ros.filter.integrity.fix_tracker import forget_tracks
 from eskf_ros.filter.integrity.traffic import Traffic
 from eskf_ros.filter.layout import STATE, WORK, blank_state
 from eskf_ros.filter.loop import advance
@@ -142,7 +141,6 @@ class Navigator(Readout):
         if state["position_known"]:
             reset_datum(state, *datum, settings)
             forget_search(state)
-            forget_tracks(state)
             note_jump(state, position, heading, settings)
         else:
             set_datum(state, *datum)
@@ -165,7 +163,6 @@ class Navigator(Readout):
         reset_pose(
             state, tuple(float(v) for v in position_map), covariance, float(heading), float(heading_std), settings
         )
-        forget_tracks(state)
         note_jump(state, before, heading_before, settings)
         self._raise_barrier()
         return True

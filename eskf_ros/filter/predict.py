@@ -8,6 +8,7 @@ from eskf_ros.filter.inertial.covariance import propagate_covariance, propagate_
 from eskf_ros.filter.inertial.strapdown import propagate_nominal_state
 from eskf_ros.filter.state import augmented_states
 from eskf_ros.filter.state.error_state import ERROR_SIZE
+from eskf_ros.filter.state.lanes import FILTER, HUMBLE, LANES, is_running
 from eskf_ros.filter.state.time import SECOND
 from eskf_ros.geodesy.rotation import dot
 
@@ -23,7 +24,7 @@ WANDER_TIME = 1.0
 
 @njit
 def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
-    """Propagate nominal state and covariance by ``dt`` s between two raw IMU readings (m/s2, rad/s; IMU axes).
+    """Propagate one lane by ``dt`` s between two raw IMU readings (m/s2, rad/s; IMU axes).
 
     ``gap`` (s) is the length of the hole in the IMU data that is being bridged, 0 for none.
     """
@@ -31,27 +32,54 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
     coupling = 0.0 if state.heading_known == 0 else 1.0
     middle, force, gravity = propagate_nominal_state(state, force_0, rate_0, force_1, rate_1, dt, coupling)
     # Motion hidden by a gap is assumed to be constant; this density gives the same variance at its end.
-    velocity_noise = settings.accel_noise_density**2 + settings.gap_accel_std**2 * gap
-    attitude_noise = settings.gyro_noise_density**2 + settings.gap_gyro_std**2 * gap
+    accel_noise, gyro_noise, accel_walk, gyro_walk = imu_noise(state.doubt, settings)
+    velocity_noise = accel_noise + settings.gap_accel_std**2 * gap
+    attitude_noise = gyro_noise + settings.gap_gyro_std**2 * gap
     if state.heading_known == 0:
         acceleration = (force[0] + gravity[0], force[1] + gravity[1], force[2] + gravity[2])
         predict_search(state, acceleration, middle, dt, settings)
         velocity_noise += WANDER_TIME * (WANDER_ACCELERATION**2 + dot(acceleration, acceleration))
     size = state.error_size
     propagate_covariance(state.covariance, size, middle, force, gravity, state.frame.earth_rate_map, dt, coupling, work)
-    propagate_noise(state.covariance, velocity_noise, attitude_noise, dt, settings)
+    propagate_noise(state.covariance, velocity_noise, attitude_noise, accel_walk, gyro_walk, dt)
     if size > ERROR_SIZE:
         augmented_states.propagate_augmented(state, dt, settings)
 
 
 @njit
-def propagate(state, stamp, sample, settings, work):
-    """Propagate the state to ``stamp`` (ns), at or before ``sample``, the next IMU sample.
+def imu_noise(doubt, settings):
+    """Return the spectral densities of accelerometer and gyro, and of the random walks of their biases.
+
+    They are those of the parameters for the ``doubt`` 0, those of the humble lane for 1, and geometric means between.
+    """
+    told, humble = settings.imu_noise, settings.humble_noise
+    if doubt == 0.0:
+        return told[0], told[1], told[2], told[3]
+    if doubt == 1.0:
+        return humble[0], humble[1], humble[2], humble[3]
+    return (
+        between_noise(told[0], humble[0], doubt),
+        between_noise(told[1], humble[1], doubt),
+        between_noise(told[2], humble[2], doubt),
+        between_noise(told[3], humble[3], doubt),
+    )
+
+
+@njit
+def between_noise(told, humble, doubt):
+    """Return the geometric mean of two densities with the weights 1 - ``doubt`` and ``doubt``."""
+    return told ** (1.0 - doubt) * humble**doubt
+
+
+@njit
+def propagate(states, stamp, sample, settings, work):
+    """Propagate the lanes to ``stamp`` (ns), at or before ``sample``, the next IMU sample.
 
     Between two samples the IMU is the straight line whose mean is that of the parabola through them and the sample
     before (Adams-Moulton): an interval gives the same result wherever it is cut. A long interval is integrated in
     steps; one longer than the gap of the settings may hide motion and adds process noise.
     """
+    state = states[FILTER]
     interval = (sample.stamp - state.imu.stamp) / SECOND
     force_0, force_1 = line(state.imu.earlier_force, state.imu.force, sample.specific_force, interval, state, settings)
     rate_0, rate_1 = line(state.imu.earlier_rate, state.imu.rate, sample.angular_rate, interval, state, settings)
@@ -61,19 +89,24 @@ def propagate(state, stamp, sample, settings, work):
     end = (stamp - state.imu.stamp) / SECOND / interval
     force_a = between(force_0, force_1, begin)
     rate_a = between(rate_0, rate_1, begin)
+    dt = (end - begin) * interval / max(steps, 1)
+    humble = is_running(states)
     for k in range(steps):
         fraction = begin + (end - begin) * (k + 1) / steps
         force_b = between(force_0, force_1, fraction)
         rate_b = between(rate_0, rate_1, fraction)
-        step(state, force_a, rate_a, force_b, rate_b, (end - begin) * interval / steps, gap, settings, work)
+        step(state, force_a, rate_a, force_b, rate_b, dt, gap, settings, work)
+        if humble:
+            step(states[HUMBLE], force_a, rate_a, force_b, rate_b, dt, gap, settings, work)
         force_a = force_b
         rate_a = rate_b
     force = between(state.imu.force, sample.specific_force, end)
     rate = between(state.imu.rate, sample.angular_rate, end)
-    for i in range(3):
-        state.specific_force[i] = force[i]
-        state.angular_rate[i] = rate[i]
-    state.stamp = stamp
+    for lane in range(LANES):
+        for i in range(3):
+            states[lane].specific_force[i] = force[i]
+            states[lane].angular_rate[i] = rate[i]
+        states[lane].stamp = stamp
 
 
 @njit

@@ -44,7 +44,7 @@ class Readout:
     @property
     def state(self) -> np.ndarray:
         """A copy of the whole state (STATE, array of length one)."""
-        return np.array(self._states, STATE)
+        return np.array(self._states[:1], STATE)
 
     @property
     def status(self) -> Status:

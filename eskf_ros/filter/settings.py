@@ -23,6 +23,11 @@ SWITCHED_ON_SHARE = 0.1
 temperature.
 """
 
+HUMBLE_NOISE = (0.12, 6e-3, 3e-3, 3e-4)
+"""Densities of the noise of the humble lane, at least: accelerometer (m/s2/rtHz), gyro (rad/s/rtHz), and the random
+walks of their biases (m/s3/rtHz, rad/s2/rtHz). Four times the default noise, and biases that follow a step in seconds.
+"""
+
 
 def intakes_from(parameters: Parameters) -> dict[Stream, Intake]:
     """Return the `Intake` of each stream; ranges have none, `Navigator.push_ranges` checks them itself."""
@@ -64,6 +69,14 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
         "accel_bias_std",
     ):
         settings[name] = getattr(imu, name)
+    told = (
+        imu.accel_noise_density,
+        imu.gyro_noise_density,
+        imu.accel_bias_random_walk,
+        imu.gyro_bias_random_walk,
+    )
+    settings["imu_noise"] = np.square(told)
+    settings["humble_noise"] = np.square(np.maximum(HUMBLE_NOISE, np.multiply(told, (4.0, 4.0, 1.0, 1.0))))
     settings["imu_gap"] = imu.gap
     settings["gap_accel_std"] = imu.gap_accel_std
     settings["gap_gyro_std"] = imu.gap_gyro_std

@@ -6,6 +6,7 @@ import numpy as np
 
 from eskf_ros.filter.history.records import AID, IMU, TIMELINE
 from eskf_ros.filter.history.timeline import CHECKPOINT_SPACING, doubled, forget
+from eskf_ros.filter.state.lanes import LANES
 from eskf_ros.filter.state.memory import allocate
 from eskf_ros.filter.state.time import NEVER
 
@@ -23,7 +24,7 @@ class Buffers:
         """Allocate the buffers; ``state``, ``row``: record types of a checkpoint and of an output row."""
         self.imu = allocate(IMU, 4 * IMU_BATCH)
         self.aids = allocate(AID, FIRST_SIZE)
-        self.checkpoints = allocate(state, FIRST_SIZE)
+        self.checkpoints = allocate(state, (FIRST_SIZE, LANES))
         self.rows = allocate(row, len(self.imu))
         self.timeline = allocate(TIMELINE)
 

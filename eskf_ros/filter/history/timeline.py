@@ -21,6 +21,7 @@ import numpy as np
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.state.enums import CONSTRAINT_INTERVAL, SENSOR_STREAMS, Verdict
+from eskf_ros.filter.state.lanes import FILTER, LANES
 from eskf_ros.filter.state.memory import allocate
 from eskf_ros.filter.state.time import NEVER
 
@@ -63,19 +64,20 @@ def oldest_in_time(timeline):
 @njit
 def rewind(states, checkpoints, timeline, blank):
     """Restore the newest checkpoint not later than ``timeline.rewind_to``, or ``blank``, and drop the later ones."""
-    if timeline.rewind_to > states[0].stamp:
+    if timeline.rewind_to > states[FILTER].stamp:
         timeline.rewind_to = -NEVER
         return
     count = timeline.checkpoint_count
-    while count > 0 and checkpoints[count - 1].stamp > timeline.rewind_to:
+    while count > 0 and checkpoints[count - 1, FILTER].stamp > timeline.rewind_to:
         count -= 1
     timeline.checkpoint_count = count
     timeline.since_checkpoint = 0
     timeline.rewind_to = -NEVER
-    if count > 0:
-        states[0] = checkpoints[count - 1]
-    else:
-        states[0] = blank[0]
+    for lane in range(LANES):
+        if count > 0:
+            states[lane] = checkpoints[count - 1, lane]
+        else:
+            states[lane] = blank[lane]
 
 
 @njit
@@ -85,7 +87,8 @@ def save_checkpoint(states, checkpoints, timeline):
         timeline.since_checkpoint += 1
         if timeline.since_checkpoint < CHECKPOINT_SPACING:
             return
-    checkpoints[timeline.checkpoint_count] = states[0]
+    for lane in range(LANES):
+        checkpoints[timeline.checkpoint_count, lane] = states[lane]
     timeline.checkpoint_count += 1
     timeline.since_checkpoint = 0
 
@@ -340,28 +343,29 @@ def forget(states, imu, aids, checkpoints, timeline):
     """Drop what no accepted message can change: all before the newest checkpoint that is older than the window."""
     t = timeline[0]
     keep = 0
-    while keep + 1 < t.checkpoint_count and checkpoints[keep + 1].stamp < t.frontier - t.window:
+    while keep + 1 < t.checkpoint_count and checkpoints[keep + 1, FILTER].stamp < t.frontier - t.window:
         keep += 1
-    if t.checkpoint_count == 0 or checkpoints[keep].stamp >= t.frontier - t.window:
+    if t.checkpoint_count == 0 or checkpoints[keep, FILTER].stamp >= t.frontier - t.window:
         return
     # The sample of the checkpoint itself stays: it is the predecessor of what may still be inserted after it.
-    imu_gone = checkpoints[keep].imu_next - 1
-    aid_gone = min(checkpoints[keep].aid_next, t.recorded)
+    imu_gone = checkpoints[keep, FILTER].imu_next - 1
+    aid_gone = min(checkpoints[keep, FILTER].aid_next, t.recorded)
     for i in range(imu_gone, t.imu_count):
         imu[i - imu_gone] = imu[i]
     for i in range(aid_gone, t.aid_count):
         aids[i - aid_gone] = aids[i]
     for i in range(keep, t.checkpoint_count):
-        checkpoints[i - keep] = checkpoints[i]
+        for lane in range(LANES):
+            checkpoints[i - keep, lane] = checkpoints[i, lane]
     t.imu_count -= imu_gone
     t.aid_count -= aid_gone
     t.recorded -= aid_gone
     t.checkpoint_count -= keep
     for i in range(t.checkpoint_count):
-        checkpoints[i].imu_next -= imu_gone
-        checkpoints[i].aid_next -= aid_gone
-    states[0].imu_next -= imu_gone
-    states[0].aid_next -= aid_gone
+        checkpoints[i, FILTER].imu_next -= imu_gone
+        checkpoints[i, FILTER].aid_next -= aid_gone
+    states[FILTER].imu_next -= imu_gone
+    states[FILTER].aid_next -= aid_gone
 
 
 @njit
@@ -372,11 +376,13 @@ def raise_barrier(states, blank, timeline):
     """
     t = timeline[0]
     if t.frontier == NEVER:
-        blank[0] = states[0]
+        for lane in range(LANES):
+            blank[lane] = states[lane]
         return
-    states[0].imu_next = 0
-    states[0].aid_next = 0
-    blank[0] = states[0]
+    states[FILTER].imu_next = 0
+    states[FILTER].aid_next = 0
+    for lane in range(LANES):
+        blank[lane] = states[lane]
     t.imu_count = 0
     t.aid_count = 0
     t.recorded = 0
@@ -412,6 +418,6 @@ def take_final(aids, timeline, out, everything):
 
 def doubled(buffer: np.ndarray) -> np.ndarray:
     """Return a buffer of twice the size that starts with the contents of this one."""
-    bigger = allocate(buffer.dtype, 2 * len(buffer))
+    bigger = allocate(buffer.dtype, (2 * len(buffer), *buffer.shape[1:]))
     bigger[: len(buffer)] = buffer
     return bigger

@@ -89,8 +89,11 @@ def apply_transition(columns, out, count, rotation, force, up, gravity_gradient,
 
 
 @njit
-def propagate_noise(covariance, velocity_noise, attitude_noise, dt, settings):
-    """Add ``dt`` s of process noise; velocity (m2/s3) and attitude (rad2/s) noise are spectral densities."""
+def propagate_noise(covariance, velocity_noise, attitude_noise, accel_walk, gyro_walk, dt):
+    """Add ``dt`` s of process noise, all spectral densities.
+
+    Velocity (m2/s3), attitude (rad2/s), and the random walks of the biases (m2/s5, rad2/s3).
+    """
     for i in range(3):
         p, v, t, a, g = i, 3 + i, 6 + i, 9 + i, 12 + i
         covariance[p, p] += velocity_noise * dt * dt * dt / 3.0
@@ -98,8 +101,8 @@ def propagate_noise(covariance, velocity_noise, attitude_noise, dt, settings):
         covariance[v, p] += velocity_noise * dt * dt / 2.0
         covariance[v, v] += velocity_noise * dt
         covariance[t, t] += attitude_noise * dt
-        covariance[a, a] += settings.accel_bias_random_walk**2 * dt
-        covariance[g, g] += settings.gyro_bias_random_walk**2 * dt
+        covariance[a, a] += accel_walk * dt
+        covariance[g, g] += gyro_walk * dt
 
 
 @njit

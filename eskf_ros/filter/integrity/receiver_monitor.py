@@ -20,11 +20,11 @@ import numpy as np
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import body_rate
 from eskf_ros.filter.inertial.strapdown import gravity_map
-from eskf_ros.filter.integrity.fix_tracker import is_led
 from eskf_ros.filter.measurements.gnss_position import noise_factor
 from eskf_ros.filter.measurements.gnss_velocity import predict
 from eskf_ros.filter.state.enums import Stream, Verdict
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, SOURCES, VELOCITY
+from eskf_ros.filter.state.streams import is_live
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.geodesy.rotation import cross, rotate, to_matrix
 
@@ -42,8 +42,6 @@ RECEIVER_MONITOR = np.dtype(
         ("fix_count", "i8", (SOURCES,)),
         ("scattered_fixes", "i8", (SOURCES,)),
         ("scatter_sum", "f8", (SOURCES,)),
-        ("contradicted_fixes", "i8", (SOURCES,)),
-        ("contradiction_rate", "f8", (SOURCES,)),
         ("velocity_nis", "f8", (SOURCES, 2)),
         ("coasts", "i8"),
         ("coast_nis", "f8"),
@@ -62,8 +60,6 @@ RECEIVER_MONITOR = np.dtype(
 - ``departures``, ``departure_stamp``: how often a CUSUM reached its threshold, and when first (ns).
 - ``seen_stamp``, ``fix_count``: the last fix (ns), and the number of fixes.
 - ``scattered_fixes``, ``scatter_sum``: fixes with inflated noise, and the sum of their factors.
-- ``contradicted_fixes``, ``contradiction_rate``: fixes that contradict the velocities, and the largest difference
-  (m/s).
 - ``velocity_nis``: running mean of the NIS of the velocities per degree of freedom, and their number.
 - ``coasts``, ``coast_nis``: outages, and the sum of the NIS per degree of freedom of the first fixes after them.
 - ``heading_mark_stamp``, ``heading_mark_std``: the last check of the heading (ns), and its standard deviation (rad).
@@ -106,9 +102,6 @@ LONG_COAST = 5_000_000_000
 MANY_FIXES = 50
 """Fixes that a receiver must have sent before anything of it is reported. Velocities need twice as many."""
 
-FEW_FIXES = 5
-"""Contradicted fixes up to this number may be an accident and are not reported."""
-
 MODEST_SCATTER = 0.12
 """Scatter of the fixes over the standard deviation they claim, below which the claim is reported as too large."""
 
@@ -139,7 +132,7 @@ def watch_aid(state, aid, size, gate, work, settings):
         watch_fix(state, aid)
     elif aid.stream == Stream.GNSS_VELOCITY:
         watch_velocity(state, aid)
-    if aid.stream == Stream.GNSS_VELOCITY or (aid.stream == Stream.GNSS_POSITION and not is_led(state, aid.source)):
+    if aid.stream == Stream.GNSS_VELOCITY or (aid.stream == Stream.GNSS_POSITION and not is_live(state, Stream.GNSS_VELOCITY.value, aid.source)):
         watch_departure(state, aid.source, work)
     if aid.stream == Stream.GNSS_POSITION:
         watch_heading_std(state, settings)
@@ -184,7 +177,7 @@ def learn_faults(state, aid, size, gate, work, settings):
     if state.receiver.fault_stamp == NEVER:
         state.receiver.fault_absorbed.fill(0.0)
     dt = carry_absorbed(state)
-    accepted = aid.verdict in (Verdict.FUSED, Verdict.WEIGHED_DOWN)
+    accepted = aid.verdict in (Verdict.FUSED, Verdict.WEIGHED_DOWN, Verdict.TAKEOVER)
     for source in range(SOURCES):
         absorbed = state.receiver.fault_absorbed[source]
         write_effect(state, aid, work, settings)
@@ -201,7 +194,7 @@ def learn_faults(state, aid, size, gate, work, settings):
                     effect[a, k] = 0.0
                 for i in range(ERROR_SIZE):
                     effect[a, k] -= work.jacobian[a, i] * absorbed[i, k]
-        if is_own and aid.verdict != Verdict.CONTRADICTED:
+        if is_own:
             weigh_faults(state, source, dt, min(1.0, gate / max(aid.nis, 1e-9)), work)
         if accepted:
             for i in range(ERROR_SIZE):
@@ -268,7 +261,7 @@ def weigh_faults(state, source, dt, weight, work):
 
 @njit
 def watch_fix(state, aid):
-    """Count fixes with inflated noise, fixes that contradict the velocities, and first fixes after an outage."""
+    """Count fixes with inflated noise, and first fixes after an outage."""
     source = aid.source
     state.receiver.fix_count[source] += 1
     if NEVER < state.receiver.seen_stamp[source] < state.stamp - LONG_COAST and state.heading_known == 1:
@@ -279,11 +272,6 @@ def watch_fix(state, aid):
     if factor > 1.0:
         state.receiver.scattered_fixes[source] += 1
         state.receiver.scatter_sum[source] += factor
-    if aid.verdict == Verdict.CONTRADICTED:
-        rate = state.tracker.rate[source]
-        state.receiver.contradicted_fixes[source] += 1
-        speed = math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
-        state.receiver.contradiction_rate[source] = max(state.receiver.contradiction_rate[source], speed)
 
 
 @njit

@@ -11,7 +11,6 @@ from eskf_ros.filter.integrity.receiver_monitor import (
     FAULT_PRIOR,
     FAULT_SIGMAS,
     FEW_DEPARTURES,
-    FEW_FIXES,
     HIGH_NIS,
     LEVER_ARM_ERROR,
     MANY_FIXES,
@@ -100,7 +99,7 @@ def _covariance_complaints(state: np.void, source: int, scale: float) -> list[st
             f"the fixes{_of(source)} scatter {math.sqrt(factor):.1f} times as much as they claim ({scattered} of "
             f"{count}): set gnss.covariance_scale to {factor * scale:.2g}, or gnss.position_std_floor"
         ]
-    share = math.sqrt(float(state["tracker"]["scatter"][source]))
+    share = math.sqrt(float(state["scatter"]["ratio"][source]))
     if share < MODEST_SCATTER:
         return [
             f"the fixes{_of(source)} scatter {share:.2f} times as much as they claim: they are better than that "
@@ -121,15 +120,9 @@ def _velocity_complaints(state: np.void, source: int) -> list[str]:
 
 def _path_complaints(state: np.void, source: int) -> list[str]:
     found = []
-    contradicted, jumps = int(state["receiver"]["contradicted_fixes"][source]), int(state["tracker"]["jumps"][source])
-    if contradicted > FEW_FIXES:
-        found.append(
-            f"{contradicted} fixes{_of(source)} moved otherwise than the velocities of the same receiver, by up to "
-            f"{float(state['receiver']['contradiction_rate'][source]):.1f} m/s: multipath or spoofing; they "
-            "were not fused"
-        )
+    jumps = int(state["trust"]["jumps"][0, source])
     if jumps:
-        length = float(state["tracker"]["jump"][source])
+        length = float(state["trust"]["jump"][0, source])
         found.append(
             f"the fixes{_of(source)} jumped {jumps} times, by up to {length:.0f} m, and their velocities did not: "
             "multipath or spoofing"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.heading_search import forget_search
-from eskf_ros.filter.integrity.fix_tracker import forget_tracks
 from eskf_ros.filter.state.time import NEVER
 
 
@@ -13,11 +12,9 @@ def reset_alignment(state):
     """Restart the alignment: level, position and heading are unknown again; the datum stays."""
     state.restarts += 1
     forget_search(state)
-    forget_tracks(state)
     state.heading.candidate_count = 0
     state.heading.given_stamp = NEVER
     state.recovery.rejected_fixes = 0
-    state.recovery.recent_resets = 0
     state.level_known = 0
     state.position_known = 0
     state.heading_known = 0

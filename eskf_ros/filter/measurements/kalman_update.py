@@ -18,21 +18,45 @@ def update(state, size, gate, work):
     """Fuse ``size`` scalars described by ``work.jacobian``, ``work.innovation``, ``work.noise``, ``work.shared``.
 
     Returns the verdict and the normalised innovation squared (NIS); the state changes only if the verdict is FUSED.
-    ``gate`` is the largest NIS that is accepted. Joseph form with the full product (I - K H) P (I - K H)' + K R K'
-    (Groves, eq. 3.58), evaluated through its rank-``size`` parts, and extended by the covariance C of noise and errors
-    (Brown and Hwang, Introduction to Random Signals, section 5.5). ``work.innovation_covariance`` contains the inverse
-    of the innovation covariance afterwards.
+    ``gate`` is the largest NIS that is accepted.
+    """
+    nis, determinant = judge(state, size, work)
+    if determinant == 0.0:
+        return Verdict.BAD_COVARIANCE, np.nan
+    if not nis <= gate:
+        return Verdict.GATE, nis
+    apply(state, size, work)
+    return Verdict.FUSED, nis
+
+
+@njit
+def judge(state, size, work):
+    """Return the NIS of the measurement in ``work``, and the determinant of its innovation covariance.
+
+    The determinant is 0 if the covariance is not positive definite, and the NIS is NaN then. ``work.projected`` and, in
+    ``work.innovation_covariance``, the inverse of the innovation covariance are left for `apply`.
     """
     project(state, size, work)
-    if not invert_positive(work.innovation_covariance, size):
-        return Verdict.BAD_COVARIANCE, np.nan
+    determinant = invert_positive(work.innovation_covariance, size)
+    if determinant == 0.0:
+        return np.nan, 0.0
     inverse = work.innovation_covariance
     nis = 0.0
     for a in range(size):
         for b in range(size):
             nis += work.innovation[a] * inverse[a, b] * work.innovation[b]
-    if not nis <= gate:
-        return Verdict.GATE, nis
+    return nis, determinant
+
+
+@njit
+def apply(state, size, work):
+    """Fuse the measurement that `judge` has seen: gain, covariance, injection and reset.
+
+    Joseph form with the full product (I - K H) P (I - K H)' + K R K' (Groves, eq. 3.58), evaluated through its
+    rank-``size`` parts, and extended by the covariance C of noise and errors (Brown and Hwang, Introduction to Random
+    Signals, section 5.5).
+    """
+    inverse = work.innovation_covariance
     for i in range(state.error_size):
         correction = 0.0
         for a in range(size):
@@ -47,7 +71,6 @@ def update(state, size, gate, work):
     # The error is now about the injected attitude (Sola, section 6.3.1, with the full Jacobian).
     turn = (work.correction[ATTITUDE], work.correction[ATTITUDE + 1], work.correction[ATTITUDE + 2])
     update_error_axes(state.covariance, ATTITUDE, left_jacobian(turn))
-    return Verdict.FUSED, nis
 
 
 @njit
@@ -73,11 +96,13 @@ def project(state, size, work):
 
 @njit
 def invert_positive(matrix, size):
-    """Invert a symmetric positive definite matrix in place (Gauss-Jordan); return False if it is not one."""
+    """Invert a symmetric positive definite matrix in place (Gauss-Jordan); return its determinant, or 0 if it is none."""
+    determinant = 1.0
     for k in range(size):
         pivot = matrix[k, k]
         if not (pivot > 0.0 and pivot < math.inf):
-            return False
+            return 0.0
+        determinant *= pivot
         matrix[k, k] = 1.0
         for j in range(size):
             matrix[k, j] /= pivot
@@ -92,7 +117,7 @@ def invert_positive(matrix, size):
             mean = 0.5 * (matrix[i, j] + matrix[j, i])
             matrix[i, j] = mean
             matrix[j, i] = mean
-    return True
+    return determinant
 
 
 @njit

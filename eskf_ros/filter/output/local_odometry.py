@@ -73,7 +73,6 @@ def note_jump(state, position, heading, settings):
     """Add the correction that has moved the state from ``position`` (m, map) and ``heading`` (rad)."""
     for i in range(3):
         state.odom.jump_position[i] += state.position_map[i] - position[i]
-        state.tracker.corrections_map[i] += state.position_map[i] - position[i]
     state.odom.jump_heading += wrapped(heading_of(state, settings) - heading)
 
 

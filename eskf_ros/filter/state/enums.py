@@ -44,7 +44,7 @@ class Verdict(IntEnum):
     GATE: outside the innovation gate. WEIGHED_DOWN: fused with inflated noise. INACTIVE: the measurement says nothing
     at the moment, such as a ZUPT in motion; it leaves no record. CONTRADICTED: a position that moves otherwise than the
     velocity of the same receiver. RESET: the last of several rejected measurements that agree with each other; the
-    filter was reset to them.
+    filter was reset to them. TAKEOVER: fused, and the filter continues from the humble lane, which predicted it better.
     """
 
     WAITING = 0
@@ -64,6 +64,7 @@ class Verdict(IntEnum):
     LOW_ELEVATION = 14
     CONTRADICTED = 15
     RESET = 16
+    TAKEOVER = 17
 
 
 class Stream(IntEnum):

@@ -107,7 +107,7 @@ def solve_epoch(work):
                 work.right[i] += weight * a * work.signal_innovation[k]
                 for j in range(4):
                     normal[i, j] += weight * a * (work.signal_direction[k, j] if j < 3 else 1.0)
-        if not invert_positive(normal, 4):
+        if invert_positive(normal, 4) == 0.0:
             return False
         for i in range(4):
             for j in range(4):

@@ -1,0 +1,305 @@
+"""Two lanes: beside the filter runs a humble one, which judges the filter and the receivers.
+
+The humble lane is the same filter, but it does not believe the IMU: its noise is wide (`settings.humble_noise`), so
+that biases that step, wander, clip or scale are followed within seconds. It hears positions and velocities of GNSS
+alone, and refuses only what jumps. It is less accurate than the filter, and hardly ever wrong.
+
+- The filter is wrong where the humble lane predicts the receiver much better: the sum of the differences of their log
+  likelihoods reaches a threshold (CUSUM; Page, Continuous inspection schemes, 1954), or the headings of the two are
+  further apart than their covariances allow (Hausman, Specification tests in econometrics, 1978: the difference of an
+  efficient and a robust estimate has the variance of the difference). The filter then continues from the humble lane,
+  and its own IMU noise, wide at first, narrows again over ``doubt_time``.
+- A receiver is wrong where even the humble lane is surprised. What it sends is refused until it has agreed with itself
+  for long enough (`patience_for`): the shorter, the more streams contradict the humble lane.
+
+The humble lane runs while the heading is known, and starts from the filter.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.inertial.navigation_frame import heading_of
+from eskf_ros.filter.measurements import gnss_position, gnss_velocity
+from eskf_ros.filter.measurements.kalman_update import apply, judge
+from eskf_ros.filter.state.augmented_states import reset_augmented
+from eskf_ros.filter.state.enums import Stream
+from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, SOURCES, VELOCITY
+from eskf_ros.filter.state.lanes import FILTER, HUMBLE, is_running
+from eskf_ros.filter.state.streams import is_live
+from eskf_ros.filter.state.time import NEVER
+from eskf_ros.geodesy.rotation import wrapped
+
+TRUST = np.dtype(
+    [
+        ("evidence", "f8"),
+        ("doubt_stamp", "i8"),
+        ("doubt_time", "f8"),
+        ("takeovers", "i8"),
+        ("refused", "i8", (2, SOURCES)),
+        ("refused_since", "i8", (2, SOURCES)),
+        ("refused_stamp", "i8", (2, SOURCES)),
+        ("refused_innovation", "f8", (2, SOURCES, 3)),
+        ("jumps", "i8", (2, SOURCES)),
+        ("jump", "f8", (2, SOURCES)),
+    ],
+    align=True,
+)
+"""What the lanes think of each other and of the receivers; the latter by kind (0 position, 1 velocity) and source.
+
+- ``evidence``: sum of log likelihood ratios against the filter (CUSUM).
+- ``doubt_stamp``, ``doubt_time``: when the humble lane took over last (ns), and how long the noise narrows (s).
+- ``takeovers``: how often the humble lane took over.
+- ``refused``, ``refused_since``, ``refused_stamp``: messages refused in a row, the first and the last of them (ns).
+- ``refused_innovation``: innovation of the last refused one in the humble lane (m or m/s, map).
+- ``jumps``, ``jump``: how often a stream jumped, and the furthest (m or m/s).
+"""
+
+EVIDENCE = 20.0
+"""Log likelihood ratio from which on the filter is wrong: by chance once in exp(20) messages."""
+
+LARGEST_NIS = 30.0
+"""A single innovation counts with at most this NIS in the likelihoods: wild messages are not evidence."""
+
+HEADING_SIGMAS = 5.0
+"""Standard deviations by which the headings of the lanes must differ for the filter to be wrong."""
+
+FIRST_DOUBT = 20.0
+"""s; time over which the noise of the filter narrows after the first takeover."""
+
+LONGEST_DOUBT = 320.0
+"""s; the time doubles with every takeover during the doubt, up to this, and halves after a time without."""
+
+JUMP_GATE = 30.7
+"""NIS of 3 scalars in the humble lane beyond which a message jumps: the chi-square quantile of 1 - 1e-6."""
+
+AGREEMENT_GATE = 16.27
+"""NIS of the difference of two refused messages up to which they agree: the chi-square quantile of 0.999."""
+
+FEWEST = 4
+"""Refused messages in a row that must agree with each other before they are believed."""
+
+SHORT_PATIENCE = 1_000_000_000
+"""ns; position and velocity that both contradict the humble lane are believed after this time: the IMU is wrong."""
+
+PATIENCE = 10_000_000_000
+"""ns; a stream that contradicts the humble lane, and has no other beside it, is believed after this time."""
+
+LONG_PATIENCE = 30_000_000_000
+"""ns; a stream is believed after this time though the other one of the same receiver agrees with the humble lane."""
+
+LOST_HEADING_STD = 0.5
+"""rad; a humble lane that knows the heading no better starts anew from the filter."""
+
+OPENED_VELOCITY_STD = 10.0
+"""m/s per axis; of a velocity that nothing confirms."""
+
+OPENED_TILT_STD = 0.1
+"""rad per axis; of roll and pitch after a fault of the IMU."""
+
+OPENED_HEADING_STD = 0.5
+"""rad; of the heading after a fault of the IMU."""
+
+
+OPENED_GYRO_BIAS_STD = 0.01
+"""rad/s; of the gyro bias after a fault of the IMU."""
+
+
+@njit
+def kind_of(stream):
+    """Return 0 for positions, 1 for velocities of GNSS, -1 for all else: the humble lane does not hear it."""
+    if stream == Stream.GNSS_POSITION:
+        return 0
+    if stream == Stream.GNSS_VELOCITY:
+        return 1
+    return -1
+
+
+@njit
+def start(states):
+    """Start the humble lane from the filter, where the heading is known; start it anew where it has lost its own."""
+    state, humble = states[FILTER], states[HUMBLE]
+    if state.heading_known == 0 or state.position_known == 0:
+        humble.heading_known = 0
+        return
+    if is_running(states) and humble.covariance[ATTITUDE + 2, ATTITUDE + 2] < LOST_HEADING_STD**2:
+        return
+    states[HUMBLE] = states[FILTER]
+    humble.error_size = ERROR_SIZE
+    humble.doubt = 1.0
+    state.trust.evidence = 0.0
+
+
+@njit
+def linearize(lane, aid, settings, work):
+    """Write innovation, Jacobian and noise of a position or velocity of GNSS in a lane to ``work``."""
+    if aid.stream == Stream.GNSS_POSITION:
+        return gnss_position.linearize(lane, aid.payload, aid.source, settings, work)
+    return gnss_velocity.linearize(lane, aid.payload, aid.source, settings, work)
+
+
+@njit
+def hear(states, aid, settings, work):
+    """Let the humble lane hear a message.
+
+    Returns whether it jumps, whether it is believed now after many like it were refused, and NIS and log determinant of
+    its innovation.
+    """
+    state, humble = states[FILTER], states[HUMBLE]
+    kind, source = kind_of(aid.stream), aid.source
+    size = linearize(humble, aid, settings, work)
+    nis, determinant = judge(humble, size, work)
+    believed = False
+    if not nis <= JUMP_GATE:
+        if not note_jump(state, humble, aid, kind, work):
+            return True, False, nis, 0.0
+        reset_to_message(state, humble, kind, source, work)
+        size = linearize(humble, aid, settings, work)
+        nis, determinant = judge(humble, size, work)
+        believed = True
+    state.trust.refused[kind, source] = 0
+    apply(humble, size, work)
+    return False, believed, nis, math.log(determinant)
+
+
+@njit
+def note_jump(state, humble, aid, kind, work):
+    """Count a message that jumps; say whether those refused agree and have lasted for long enough to be believed."""
+    trust, source = state.trust, aid.source
+    count = trust.refused[kind, source]
+    if count > 0:
+        dt = (aid.stamp - trust.refused_stamp[kind, source]) * 1e-9
+        nis = 0.0
+        for i in range(3):
+            change = work.innovation[i] - trust.refused_innovation[kind, source, i]
+            drift = humble.covariance[VELOCITY + i, VELOCITY + i] * dt * dt if kind == 0 else dt * dt
+            nis += change * change / (2.0 * work.noise[i, i] + drift)
+        if nis > AGREEMENT_GATE:
+            count = 0
+    if count == 0:
+        trust.refused_since[kind, source] = aid.stamp
+        trust.jumps[kind, source] += 1
+    square = 0.0
+    for i in range(3):
+        trust.refused_innovation[kind, source, i] = work.innovation[i]
+        square += work.innovation[i] ** 2
+    trust.jump[kind, source] = max(trust.jump[kind, source], math.sqrt(square))
+    trust.refused[kind, source] = count + 1
+    trust.refused_stamp[kind, source] = aid.stamp
+    lasted = aid.stamp - trust.refused_since[kind, source]
+    return count + 1 >= FEWEST and lasted >= patience_for(state, kind, source)
+
+
+@njit
+def patience_for(state, kind, source):
+    """Return the time (ns) for which refused messages of a receiver must agree before they are believed."""
+    other = 1 - kind
+    stream = Stream.GNSS_VELOCITY.value if kind == 0 else Stream.GNSS_POSITION.value
+    if not is_live(state, stream, source):
+        return PATIENCE
+    return SHORT_PATIENCE if state.trust.refused[other, source] > 0 else LONG_PATIENCE
+
+
+@njit
+def reset_to_message(state, lane, kind, source, work):
+    """Open what a message contradicts, which is believed now; ``work`` holds its innovation and noise.
+
+    A position alone moves the position. A velocity moves the velocity and opens the attitude and the biases, which
+    have led it astray; so does a position without a velocity beside it.
+    """
+    is_inertial = state.trust.refused[1 - kind, source] > 0 or kind == 1
+    if not is_live(state, Stream.GNSS_VELOCITY.value, source):
+        is_inertial = True
+    block = POSITION if kind == 0 else VELOCITY
+    reset_block(lane, block)
+    for i in range(3):
+        if kind == 0:
+            lane.position_map[i] += work.innovation[i]
+        else:
+            lane.velocity_map[i] += work.innovation[i]
+        lane.covariance[block + i, block + i] = 4.0 * work.noise[i, i]
+    if not is_inertial:
+        return
+    if kind == 0:
+        reset_block(lane, VELOCITY)
+        for i in range(3):
+            lane.covariance[VELOCITY + i, VELOCITY + i] = OPENED_VELOCITY_STD**2
+    for i in range(3):
+        std = OPENED_HEADING_STD if i == 2 else OPENED_TILT_STD
+        lane.covariance[ATTITUDE + i, ATTITUDE + i] += std**2
+        lane.covariance[GYRO_BIAS + i, GYRO_BIAS + i] += OPENED_GYRO_BIAS_STD**2
+
+
+@njit
+def reset_block(lane, block):
+    """Zero the variances and correlations of the three errors from index ``block``."""
+    for i in range(block, block + 3):
+        for j in range(len(lane.covariance)):
+            lane.covariance[i, j] = 0.0
+            lane.covariance[j, i] = 0.0
+
+
+@njit
+def compare(states, aid, nis, log_determinant, humble_nis, humble_log_determinant, settings):
+    """Compare how well the lanes predicted a message; let the humble lane take over where the filter is wrong."""
+    state = states[FILTER]
+    narrow_noise(state)
+    if aid.stream == Stream.GNSS_VELOCITY or not is_live(state, Stream.GNSS_VELOCITY.value, aid.source):
+        ratio = min(nis, LARGEST_NIS) + log_determinant - min(humble_nis, LARGEST_NIS) - humble_log_determinant
+        state.trust.evidence = max(0.0, state.trust.evidence + 0.5 * ratio)
+    if state.trust.evidence < EVIDENCE and not is_heading_apart(states, settings):
+        return False
+    reset_to_humble_lane(states, settings)
+    return True
+
+
+@njit
+def is_heading_apart(states, settings):
+    """Say whether the heading of the filter is further from that of the humble lane than the covariances allow."""
+    state, humble = states[FILTER], states[HUMBLE]
+    variance = humble.covariance[ATTITUDE + 2, ATTITUDE + 2] - state.covariance[ATTITUDE + 2, ATTITUDE + 2]
+    apart = wrapped(heading_of(state, settings) - heading_of(humble, settings))
+    return variance > 0.0 and apart * apart > HEADING_SIGMAS**2 * variance
+
+
+@njit
+def narrow_noise(state):
+    """Let the doubt about the IMU fade from 1 to 0 over ``doubt_time`` after a takeover."""
+    if state.doubt == 0.0:
+        return
+    passed = (state.stamp - state.trust.doubt_stamp) * 1e-9
+    state.doubt = max(0.0, 1.0 - passed / state.trust.doubt_time)
+
+
+@njit
+def reset_to_humble_lane(states, settings):
+    """Continue the filter from the humble lane, with wide IMU noise that narrows again."""
+    state, humble = states[FILTER], states[HUMBLE]
+    for i in range(3):
+        state.position_map[i] = humble.position_map[i]
+        state.velocity_map[i] = humble.velocity_map[i]
+        state.accel_bias[i] = humble.accel_bias[i]
+        state.gyro_bias[i] = humble.gyro_bias[i]
+    for i in range(4):
+        state.attitude[i] = humble.attitude[i]
+    for i in range(ERROR_SIZE):
+        for j in range(ERROR_SIZE):
+            state.covariance[i, j] = humble.covariance[i, j]
+        for j in range(ERROR_SIZE, state.error_size):
+            state.covariance[i, j] = 0.0
+            state.covariance[j, i] = 0.0
+    if settings.position_error_at < state.error_size:
+        reset_augmented(state, settings.position_error_at, 3, settings)
+    trust = state.trust
+    passed = (state.stamp - trust.doubt_stamp) * 1e-9 if trust.doubt_stamp != NEVER else math.inf
+    if passed < 3.0 * trust.doubt_time:
+        trust.doubt_time = min(2.0 * trust.doubt_time, LONGEST_DOUBT)
+    else:
+        trust.doubt_time = FIRST_DOUBT
+    trust.doubt_stamp = state.stamp
+    trust.evidence = 0.0
+    trust.takeovers += 1
+    state.doubt = 1.0
