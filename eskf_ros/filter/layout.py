@@ -219,6 +219,7 @@ _NEVER = {
         "reset_stamp",
     ),
     "trust": ("doubt_stamp",),
+    "scatter": ("last_stamp",),
     "mag": ("disturbed_stamp",),
     "heading": ("given_stamp",),
     "rest": (

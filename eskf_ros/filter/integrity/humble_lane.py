@@ -43,6 +43,7 @@ TRUST = np.dtype(
         ("refused_since", "i8", (2, SOURCES)),
         ("refused_stamp", "i8", (2, SOURCES)),
         ("refused_innovation", "f8", (2, SOURCES, 3)),
+        ("first_innovation", "f8", (2, SOURCES, 3)),
         ("jumps", "i8", (2, SOURCES)),
         ("jump", "f8", (2, SOURCES)),
     ],
@@ -54,7 +55,7 @@ TRUST = np.dtype(
 - ``doubt_stamp``, ``doubt_time``: when the humble lane took over last (ns), and how long the noise narrows (s).
 - ``takeovers``: how often the humble lane took over.
 - ``refused``, ``refused_since``, ``refused_stamp``: messages refused in a row, the first and the last of them (ns).
-- ``refused_innovation``: innovation of the last refused one in the humble lane (m or m/s, map).
+- ``refused_innovation``, ``first_innovation``: innovation of the last and of the first refused one (m or m/s, map).
 - ``jumps``, ``jump``: how often a stream jumped, and the furthest (m or m/s).
 """
 
@@ -67,10 +68,10 @@ LARGEST_NIS = 30.0
 HEADING_SIGMAS = 5.0
 """Standard deviations by which the headings of the lanes must differ for the filter to be wrong."""
 
-FIRST_DOUBT = 20.0
+FIRST_DOUBT = 60.0
 """s; time over which the noise of the filter narrows after the first takeover."""
 
-LONGEST_DOUBT = 320.0
+LONGEST_DOUBT = 960.0
 """s; the time doubles with every takeover during the doubt, up to this, and halves after a time without."""
 
 JUMP_GATE = 30.7
@@ -85,17 +86,17 @@ FEWEST = 4
 SHORT_PATIENCE = 1_000_000_000
 """ns; position and velocity that both contradict the humble lane are believed after this time: the IMU is wrong."""
 
-PATIENCE = 10_000_000_000
-"""ns; a stream that contradicts the humble lane, and has no other beside it, is believed after this time."""
-
 LONG_PATIENCE = 30_000_000_000
-"""ns; a stream is believed after this time though the other one of the same receiver agrees with the humble lane."""
+"""ns; a stream that stepped aside is believed after this time at the latest."""
 
 LOST_HEADING_STD = 0.5
 """rad; a humble lane that knows the heading no better starts anew from the filter."""
 
 OPENED_VELOCITY_STD = 10.0
 """m/s per axis; of a velocity that nothing confirms."""
+
+OPENED_ACCELERATION_STD = 3.0
+"""m/s2 per axis; of refused velocities about each other."""
 
 OPENED_TILT_STD = 0.1
 """rad per axis; of roll and pitch after a fault of the IMU."""
@@ -166,41 +167,71 @@ def hear(states, aid, settings, work):
 
 
 @njit
-def note_jump(state, humble, aid, kind, work):
-    """Count a message that jumps; say whether those refused agree and have lasted for long enough to be believed."""
+def note_jump(state, lane, aid, kind, work):
+    """Count a message that jumps; say whether those refused have agreed for long enough to be believed.
+
+    ``work`` holds its innovation in the lane that judges, and its noise. Offsets that stay the same are those of a
+    receiver that has stepped aside; offsets that grow come from an IMU that goes astray, unless the velocities of the
+    same receiver agree with the IMU.
+    """
     trust, source = state.trust, aid.source
-    count = trust.refused[kind, source]
-    if count > 0:
-        dt = (aid.stamp - trust.refused_stamp[kind, source]) * 1e-9
-        nis = 0.0
-        for i in range(3):
-            change = work.innovation[i] - trust.refused_innovation[kind, source, i]
-            drift = humble.covariance[VELOCITY + i, VELOCITY + i] * dt * dt if kind == 0 else dt * dt
-            nis += change * change / (2.0 * work.noise[i, i] + drift)
-        if nis > AGREEMENT_GATE:
-            count = 0
-    if count == 0:
+    is_backed = is_other_agreeing(state, kind, source)
+    dt = (aid.stamp - trust.refused_stamp[kind, source]) * 1e-9
+    passed = (aid.stamp - trust.refused_since[kind, source]) * 1e-9
+    rate = OPENED_VELOCITY_STD if kind == 0 else OPENED_ACCELERATION_STD
+    follows, stays = 0.0, 0.0
+    for i in range(3):
+        variance = lane.covariance[VELOCITY + i, VELOCITY + i] if kind == 0 else OPENED_ACCELERATION_STD**2
+        noise = 2.0 * work.noise[i, i]
+        follows += (work.innovation[i] - trust.refused_innovation[kind, source, i]) ** 2 / (noise + (rate * dt) ** 2)
+        stays += (work.innovation[i] - trust.first_innovation[kind, source, i]) ** 2 / (noise + variance * passed**2)
+    agrees = stays <= AGREEMENT_GATE or (follows <= AGREEMENT_GATE and not is_backed)
+    if trust.refused[kind, source] == 0 or not agrees:
+        if trust.refused[kind, source] == 0:
+            trust.jumps[kind, source] += 1
+        trust.refused[kind, source] = 0
         trust.refused_since[kind, source] = aid.stamp
-        trust.jumps[kind, source] += 1
+        for i in range(3):
+            trust.first_innovation[kind, source, i] = work.innovation[i]
+    trust.refused[kind, source] += 1
+    trust.refused_stamp[kind, source] = aid.stamp
     square = 0.0
     for i in range(3):
         trust.refused_innovation[kind, source, i] = work.innovation[i]
         square += work.innovation[i] ** 2
     trust.jump[kind, source] = max(trust.jump[kind, source], math.sqrt(square))
-    trust.refused[kind, source] = count + 1
-    trust.refused_stamp[kind, source] = aid.stamp
     lasted = aid.stamp - trust.refused_since[kind, source]
-    return count + 1 >= FEWEST and lasted >= patience_for(state, kind, source)
+    is_apart = stays > AGREEMENT_GATE or is_other_refused(state, kind, source)
+    patience = SHORT_PATIENCE if is_apart else patience_for(state, aid.stream, source)
+    return trust.refused[kind, source] >= FEWEST and lasted >= patience
 
 
 @njit
-def patience_for(state, kind, source):
-    """Return the time (ns) for which refused messages of a receiver must agree before they are believed."""
-    other = 1 - kind
-    stream = Stream.GNSS_VELOCITY.value if kind == 0 else Stream.GNSS_POSITION.value
-    if not is_live(state, stream, source):
-        return PATIENCE
-    return SHORT_PATIENCE if state.trust.refused[other, source] > 0 else LONG_PATIENCE
+def other_stream(kind):
+    """Return the stream of the other kind of message: velocities for positions (0), positions for velocities."""
+    return Stream.GNSS_VELOCITY.value if kind == 0 else Stream.GNSS_POSITION.value
+
+
+@njit
+def is_other_refused(state, kind, source):
+    """Say whether the other kind of message of a receiver contradicts the humble lane, too: then the IMU is wrong."""
+    return is_live(state, other_stream(kind), source) and state.trust.refused[1 - kind, source] > 0
+
+
+@njit
+def is_other_agreeing(state, kind, source):
+    """Say whether the other kind of message of a receiver comes and agrees with the humble lane."""
+    return is_live(state, other_stream(kind), source) and state.trust.refused[1 - kind, source] == 0
+
+
+@njit
+def patience_for(state, stream, source):
+    """Return the time (ns) for which offsets that stay the same must last: as long as the stream was believed before.
+
+    Right after an outage or a start there is little that speaks against them.
+    """
+    support = state.streams.fused_stamp[stream, source] - state.streams.fused_since[stream, source]
+    return min(max(support, SHORT_PATIENCE), LONG_PATIENCE)
 
 
 @njit
@@ -210,9 +241,7 @@ def reset_to_message(state, lane, kind, source, work):
     A position alone moves the position. A velocity moves the velocity and opens the attitude and the biases, which
     have led it astray; so does a position without a velocity beside it.
     """
-    is_inertial = state.trust.refused[1 - kind, source] > 0 or kind == 1
-    if not is_live(state, Stream.GNSS_VELOCITY.value, source):
-        is_inertial = True
+    is_inertial = kind == 1 or not is_other_agreeing(state, kind, source)
     block = POSITION if kind == 0 else VELOCITY
     reset_block(lane, block)
     for i in range(3):

@@ -26,7 +26,7 @@ from eskf_ros.filter.integrity.humble_lane import (
     start,
 )
 from eskf_ros.filter.integrity.recovery import note, note_reset
-from eskf_ros.filter.measurements.gnss_position import noise_factor
+from eskf_ros.filter.measurements import gnss_position, gnss_velocity
 from eskf_ros.filter.measurements.kalman_update import apply, judge, project, update
 from eskf_ros.filter.state.augmented_states import reset_augmented
 from eskf_ros.filter.state.enums import Stream, Verdict
@@ -34,11 +34,21 @@ from eskf_ros.filter.state.error_state import POSITION, SOURCES
 from eskf_ros.filter.state.lanes import FILTER, HUMBLE, is_running
 from eskf_ros.filter.state.streams import is_live
 
-SCATTER = np.dtype([("ratio", "f8", (SOURCES,)), ("paid", "f8", (SOURCES,))], align=True)
-"""Scatter of the fixes about the humble lane, by source.
+SCATTER = np.dtype(
+    [
+        ("ratio", "f8", (2, SOURCES)),
+        ("paid", "f8", (SOURCES,)),
+        ("last_stamp", "i8", (SOURCES,)),
+        ("last_innovation", "f8", (SOURCES, 3)),
+    ],
+    align=True,
+)
+"""Scatter of the messages of the receivers, by source.
 
-``ratio``: mean square over what the covariances allow. ``paid``: the noise factor for which the position was widened
-last.
+- ``ratio``: mean square of the innovations in the humble lane over what the covariances allow, for positions (0) and
+  velocities (1). That of positions is taken from the differences of two fixes: errors that last cancel in them.
+- ``paid``: the noise factor for which the position was widened last.
+- ``last_stamp``, ``last_innovation``: of the last fix (ns; m, map).
 """
 
 SCATTER_GAIN = 0.08
@@ -52,6 +62,9 @@ LARGEST_SCATTER = 100.0
 
 SCATTER_GROWTH = 4.0
 """Growth of the noise factor that widens the position once more. A single step aside and back does not reach it."""
+
+LONGEST_PAIR = 2_500_000_000
+"""ns; two fixes further apart than this do not show the scatter: the humble lane drifts between them."""
 
 SAME_SOLUTION = 4.0
 """Largest ratio of the variances of two consecutive fixes of the same kind of solution."""
@@ -69,7 +82,7 @@ def reset_for_new_solution(state, aid, settings):
     variance = aid.payload[XX] + aid.payload[YY]
     last = state.window.last_fix_variance[aid.source]
     if max(variance, last) > SAME_SOLUTION * min(variance, last):
-        state.scatter.ratio[aid.source] = 1.0
+        state.scatter.ratio[0, aid.source] = 1.0
         if settings.position_error_at < state.error_size and settings.correlated_share > 0.0:
             reset_augmented(state, settings.position_error_at, 3, settings)
     state.window.last_fix_variance[aid.source] = variance
@@ -81,10 +94,12 @@ def fuse_receiver(states, aid, gate, settings, work):
     state, humble = states[FILTER], states[HUMBLE]
     start(states)
     heard = is_running(states)
-    jumps, believed, humble_nis, humble_log = False, False, 0.0, 0.0
+    jumps, believed, humble_nis, humble_log, change = False, False, 0.0, 0.0, 0.0
     if heard:
-        humble.scatter.ratio[aid.source] = state.scatter.ratio[aid.source]
+        for kind in range(2):
+            humble.scatter.ratio[kind, aid.source] = state.scatter.ratio[kind, aid.source]
         jumps, believed, humble_nis, humble_log = hear(states, aid, settings, work)
+        change = innovation_change(state, aid.source, work) if aid.stream == Stream.GNSS_POSITION else humble_nis
         if believed:
             reset_to_humble_lane(states, settings)
     size = linearize(state, aid, settings, work)
@@ -111,7 +126,10 @@ def fuse_receiver(states, aid, gate, settings, work):
         aid.verdict = Verdict.GATE
     if heard and not jumps and not believed:
         if aid.stream == Stream.GNSS_POSITION:
-            inflate_position_for_scatter(state, aid.source, humble_nis, work)
+            learn_scatter(state, 0, aid.source, gnss_position.noise_factor(state, aid.source), change)
+            inflate_position_for_scatter(state, aid.source, work)
+        else:
+            learn_scatter(state, 1, aid.source, gnss_velocity.noise_factor(state, aid.source), change)
         if compare(states, aid, aid.nis, math.log(determinant), humble_nis, humble_log, settings):
             aid.verdict = Verdict.TAKEOVER
     if believed:
@@ -138,21 +156,47 @@ def update_weighed_down(state, size, excess, work):
 
 
 @njit
-def inflate_position_for_scatter(state, source, nis, work):
-    """Learn the scatter of the fixes about the humble lane; widen the position if they were trusted too much before.
+def innovation_change(state, source, work):
+    """Return the NIS (3 axes) of the change of the innovation from the fix before to this one, and remember this one.
 
-    ``nis`` is that of the newest fix in the humble lane. The running mean of the scatter is the factor on the variances
-    that the fixes claim (`gnss_position.noise_factor`). Whenever this factor has grown by `SCATTER_GROWTH`, the
-    variance of the position gains up to that of one fix, because earlier fixes were fused with too small a variance.
+    It is negative if the last fix is too long ago. ``work.innovation_covariance`` has been inverted (`judge`): the
+    innovations of both fixes have that covariance, and those of a humble lane are nearly independent.
     """
     scatter = state.scatter
-    factor = noise_factor(state, source)
-    found = min(factor * nis / 3.0, SCATTER_CLIP * max(scatter.ratio[source], 1.0))
-    scatter.ratio[source] = min(scatter.ratio[source] + SCATTER_GAIN * (found - scatter.ratio[source]), LARGEST_SCATTER)
-    paid = scatter.paid[source]
+    is_next = state.stamp - scatter.last_stamp[source] <= LONGEST_PAIR
+    scatter.last_stamp[source] = state.stamp
+    nis = 0.0
+    for a in range(3):
+        for b in range(3):
+            change_a = work.innovation[a] - scatter.last_innovation[source, a]
+            change_b = work.innovation[b] - scatter.last_innovation[source, b]
+            nis += 0.5 * change_a * work.innovation_covariance[a, b] * change_b
+    for a in range(3):
+        scatter.last_innovation[source, a] = work.innovation[a]
+    return nis if is_next else -1.0
+
+
+@njit
+def learn_scatter(state, kind, source, factor, nis):
+    """Update the running mean of the scatter of positions (``kind`` 0) or velocities (1) with the newest NIS."""
+    if nis < 0.0:
+        return
+    ratio = state.scatter.ratio[kind, source]
+    found = min(factor * nis / 3.0, SCATTER_CLIP * max(ratio, 1.0))
+    state.scatter.ratio[kind, source] = min(ratio + SCATTER_GAIN * (found - ratio), LARGEST_SCATTER)
+
+
+@njit
+def inflate_position_for_scatter(state, source, work):
+    """Widen the position if fixes were trusted too much before.
+
+    Whenever the noise factor of the fixes has grown by `SCATTER_GROWTH`, the variance of the position gains up to that
+    of one fix, because earlier fixes were fused with too small a variance.
+    """
+    factor, paid = gnss_position.noise_factor(state, source), state.scatter.paid[source]
     if factor == 1.0:
-        scatter.paid[source] = 1.0
+        state.scatter.paid[source] = 1.0
     elif factor > SCATTER_GROWTH * paid:
         for i in range(3):
             state.covariance[POSITION + i, POSITION + i] += (1.0 - paid / factor) * work.noise[i, i]
-        scatter.paid[source] = factor
+        state.scatter.paid[source] = factor

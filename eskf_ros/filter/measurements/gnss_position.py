@@ -72,7 +72,8 @@ def fill_altitude(state, payload, source, settings):
 @njit
 def noise_factor(state, source):
     """Return the factor on the covariances of a receiver's fixes that their scatter demands (see `receiver`)."""
-    return state.scatter.ratio[source] if state.scatter.ratio[source] > NOTABLE_SCATTER else 1.0
+    ratio = state.scatter.ratio[0, source]
+    return ratio if ratio > NOTABLE_SCATTER else 1.0
 
 
 @njit

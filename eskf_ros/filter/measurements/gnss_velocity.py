@@ -31,6 +31,17 @@ from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix
 SIZE = 3
 
 
+NOTABLE_SCATTER = 2.0
+"""Ratio of the scatter of velocities to the variance they claim above which their noise is inflated."""
+
+
+@njit
+def noise_factor(state, source):
+    """Return the factor on the covariances of a receiver's velocities that their scatter demands (see `receiver`)."""
+    ratio = state.scatter.ratio[1, source]
+    return ratio if ratio > NOTABLE_SCATTER else 1.0
+
+
 @njit
 def predict(state, source, settings):
     """Return the velocity (m/s, map) of the antenna of receiver ``source``."""
@@ -54,6 +65,10 @@ def linearize(state, payload, source, settings, work):
         work.innovation[i] = measured[i] - predicted[i]
     set_identity(work.jacobian, VELOCITY)
     set_east_north_up_covariance(work.noise, state, local_to_ecef, payload, 3)
+    factor = noise_factor(state, source)
+    for i in range(SIZE):
+        for j in range(SIZE):
+            work.noise[i, j] *= factor
 
     rotation = to_matrix(state.attitude)
     arm = settings.lever_arms_body[source]
