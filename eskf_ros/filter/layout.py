@@ -20,9 +20,9 @@ from eskf_ros.filter.inertial.strapdown import IMU_READINGS
 from eskf_ros.filter.integrity.heading_monitor import HEADING_MONITOR
 from eskf_ros.filter.integrity.humble_lane import TRUST
 from eskf_ros.filter.integrity.imu_monitor import IMU_MONITOR
-from eskf_ros.filter.integrity.receiver import SCATTER
 from eskf_ros.filter.integrity.receiver_monitor import RECEIVER_MONITOR
 from eskf_ros.filter.integrity.recovery import RECOVERY
+from eskf_ros.filter.integrity.scatter import SCATTER
 from eskf_ros.filter.measurements.mag import EARTH_FIELD
 from eskf_ros.filter.output.local_odometry import STEP
 from eskf_ros.filter.rows import ROWS
@@ -253,7 +253,8 @@ def blank_state() -> np.ndarray:
     for room, fields in _NEVER.items():
         for field in fields:
             state[room][field] = NEVER
-    state["scatter"]["ratio"] = state["scatter"]["paid"] = 1.0
+    for field in ("spread", "change", "white", "velocity"):
+        state["scatter"][field] = 1.0
     state["attitude"][:, 0] = 1.0
     state["levelling"]["kept_gyro_variance"] = np.inf
     state["error_size"] = ERROR_SIZE

@@ -283,19 +283,19 @@ class Gnss:
         live=True,
     )
     correlation_time: float = parameter(
-        0.0,
+        60.0,
         "s",
-        "How long the error of a position lasts (e-folding time). 0: fixes err independently of each other. Those of a "
-        "receiver at several Hz do not, and the estimate then trusts their mean too much; without corrections 30 to "
-        "300 s is usual.",
+        "How long the lasting part of the error of a position lasts (e-folding time); without corrections 30 to 300 s "
+        "is usual. 0: fixes err independently of each other, and the estimate trusts their mean.",
         minimum=0.0,
         maximum=1.0e5,
     )
     correlated_share: float = parameter(
-        0.8,
+        0.0,
         "",
-        "With a correlation_time: the share of the variance of each fix that lasts; the rest is new every time.",
-        above=0.0,
+        "Share of the variance of each fix that lasts; the rest is new every time. 0: learned from what the fixes "
+        "claim and how much they scatter.",
+        minimum=0.0,
         below=1.0,
         live=True,
     )

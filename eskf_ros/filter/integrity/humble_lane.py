@@ -28,7 +28,7 @@ from eskf_ros.filter.measurements.kalman_update import apply, judge
 from eskf_ros.filter.state.augmented_states import reset_augmented
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, SOURCES, VELOCITY
-from eskf_ros.filter.state.lanes import FILTER, HUMBLE, is_running
+from eskf_ros.filter.state.lanes import FILTER, HUMBLE, LANES, is_running
 from eskf_ros.filter.state.streams import is_live
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.geodesy.rotation import wrapped
@@ -77,6 +77,9 @@ LONGEST_DOUBT = 960.0
 JUMP_GATE = 30.7
 """NIS of 3 scalars in the humble lane beyond which a message jumps: the chi-square quantile of 1 - 1e-6."""
 
+LEAST_JUMP = (2.0, 0.5)
+"""m, m/s; smaller innovations of positions and velocities are no jumps, whatever the receiver claims."""
+
 AGREEMENT_GATE = 16.27
 """NIS of the difference of two refused messages up to which they agree: the chi-square quantile of 0.999."""
 
@@ -94,6 +97,9 @@ LOST_HEADING_STD = 0.5
 
 OPENED_VELOCITY_STD = 10.0
 """m/s per axis; of a velocity that nothing confirms."""
+
+BACKED_VELOCITY_STD = 0.05
+"""m/s per axis; of the mean velocity of the humble lane while the velocities of the receiver agree with it."""
 
 OPENED_ACCELERATION_STD = 3.0
 """m/s2 per axis; of refused velocities about each other."""
@@ -120,7 +126,7 @@ def kind_of(stream):
 
 
 @njit
-def start(states):
+def start(states, settings):
     """Start the humble lane from the filter, where the heading is known; start it anew where it has lost its own."""
     state, humble = states[FILTER], states[HUMBLE]
     if state.heading_known == 0 or state.position_known == 0:
@@ -129,7 +135,8 @@ def start(states):
     if is_running(states) and humble.covariance[ATTITUDE + 2, ATTITUDE + 2] < LOST_HEADING_STD**2:
         return
     states[HUMBLE] = states[FILTER]
-    humble.error_size = ERROR_SIZE
+    has_lasting_error = settings.position_error_at < state.error_size
+    humble.error_size = settings.position_error_at + 3 if has_lasting_error else ERROR_SIZE
     humble.doubt = 1.0
     state.trust.evidence = 0.0
 
@@ -143,7 +150,7 @@ def linearize(lane, aid, settings, work):
 
 
 @njit
-def hear(states, aid, settings, work):
+def hear(states, aid, gate, settings, work):
     """Let the humble lane hear a message.
 
     Returns whether it jumps, whether it is believed now after many like it were refused, and NIS and log determinant of
@@ -152,11 +159,19 @@ def hear(states, aid, settings, work):
     state, humble = states[FILTER], states[HUMBLE]
     kind, source = kind_of(aid.stream), aid.source
     size = linearize(humble, aid, settings, work)
+    if kind == 0 and reset_jumped_error(states, settings, work):
+        linearize(humble, aid, settings, work)
     nis, determinant = judge(humble, size, work)
     believed = False
-    if not nis <= JUMP_GATE:
-        if not note_jump(state, humble, aid, kind, work):
+    if state.trust.refused[kind, source] > 0 or is_jump(nis, kind, work):
+        if is_expected(state, aid, gate, settings, work):
+            # While it refused, the humble lane has gone astray: it starts anew from the filter.
+            state.trust.refused[kind, source] = 0
+            humble.heading_known = 0
+            return False, False, nis, math.inf
+        if not note_jump(state, aid, kind, work):
             return True, False, nis, 0.0
+        linearize(humble, aid, settings, work)
         reset_to_message(state, humble, kind, source, work)
         size = linearize(humble, aid, settings, work)
         nis, determinant = judge(humble, size, work)
@@ -167,10 +182,47 @@ def hear(states, aid, settings, work):
 
 
 @njit
-def note_jump(state, lane, aid, kind, work):
+def reset_jumped_error(states, settings, work):
+    """Forget the lasting error of the fixes if the fix in ``work`` is much closer to the path without it.
+
+    Errors by multipath end suddenly. Returns whether it was forgotten, in both lanes.
+    """
+    place = settings.position_error_at
+    if place >= states[HUMBLE].error_size:
+        return False
+    with_error, without = 0.0, 0.0
+    for i in range(3):
+        lasting = work.jacobian[i, place + i] * states[HUMBLE].optional[place - ERROR_SIZE + i]
+        with_error += work.innovation[i] ** 2 / work.noise[i, i]
+        without += (work.innovation[i] + lasting) ** 2 / work.noise[i, i]
+    if with_error - without < JUMP_GATE:
+        return False
+    for lane in range(LANES):
+        if place < states[lane].error_size:
+            reset_augmented(states[lane], place, 3, settings)
+    return True
+
+
+@njit
+def is_expected(state, aid, gate, settings, work):
+    """Say whether the filter itself expects a message: it is within its innovation gate."""
+    size = linearize(state, aid, settings, work)
+    nis, determinant = judge(state, size, work)
+    return determinant > 0.0 and nis <= gate
+
+
+@njit
+def is_jump(nis, kind, work):
+    """Say whether the innovation in ``work`` is impossible, and larger than the errors that receivers do not claim."""
+    x, y, z = work.innovation[0], work.innovation[1], work.innovation[2]
+    return not nis <= JUMP_GATE and x * x + y * y + z * z > LEAST_JUMP[kind] ** 2
+
+
+@njit
+def note_jump(state, aid, kind, work):
     """Count a message that jumps; say whether those refused have agreed for long enough to be believed.
 
-    ``work`` holds its innovation in the lane that judges, and its noise. Offsets that stay the same are those of a
+    ``work`` holds its innovation in the filter, and its noise. Offsets that stay the same are those of a
     receiver that has stepped aside; offsets that grow come from an IMU that goes astray, unless the velocities of the
     same receiver agree with the IMU.
     """
@@ -181,7 +233,8 @@ def note_jump(state, lane, aid, kind, work):
     rate = OPENED_VELOCITY_STD if kind == 0 else OPENED_ACCELERATION_STD
     follows, stays = 0.0, 0.0
     for i in range(3):
-        variance = lane.covariance[VELOCITY + i, VELOCITY + i] if kind == 0 else OPENED_ACCELERATION_STD**2
+        variance = state.covariance[VELOCITY + i, VELOCITY + i] if kind == 0 else OPENED_ACCELERATION_STD**2
+        variance = BACKED_VELOCITY_STD**2 if is_backed and kind == 0 else variance
         noise = 2.0 * work.noise[i, i]
         follows += (work.innovation[i] - trust.refused_innovation[kind, source, i]) ** 2 / (noise + (rate * dt) ** 2)
         stays += (work.innovation[i] - trust.first_innovation[kind, source, i]) ** 2 / (noise + variance * passed**2)
@@ -281,7 +334,7 @@ def compare(states, aid, nis, log_determinant, humble_nis, humble_log_determinan
         state.trust.evidence = max(0.0, state.trust.evidence + 0.5 * ratio)
     if state.trust.evidence < EVIDENCE and not is_heading_apart(states, settings):
         return False
-    reset_to_humble_lane(states, settings)
+    reset_to_humble_lane(states)
     return True
 
 
@@ -304,7 +357,7 @@ def narrow_noise(state):
 
 
 @njit
-def reset_to_humble_lane(states, settings):
+def reset_to_humble_lane(states):
     """Continue the filter from the humble lane, with wide IMU noise that narrows again."""
     state, humble = states[FILTER], states[HUMBLE]
     for i in range(3):
@@ -314,14 +367,15 @@ def reset_to_humble_lane(states, settings):
         state.gyro_bias[i] = humble.gyro_bias[i]
     for i in range(4):
         state.attitude[i] = humble.attitude[i]
-    for i in range(ERROR_SIZE):
-        for j in range(ERROR_SIZE):
+    size = humble.error_size
+    for i in range(size - ERROR_SIZE):
+        state.optional[i] = humble.optional[i]
+    for i in range(size):
+        for j in range(size):
             state.covariance[i, j] = humble.covariance[i, j]
-        for j in range(ERROR_SIZE, state.error_size):
+        for j in range(size, state.error_size):
             state.covariance[i, j] = 0.0
             state.covariance[j, i] = 0.0
-    if settings.position_error_at < state.error_size:
-        reset_augmented(state, settings.position_error_at, 3, settings)
     trust = state.trust
     passed = (state.stamp - trust.doubt_stamp) * 1e-9 if trust.doubt_stamp != NEVER else math.inf
     if passed < 3.0 * trust.doubt_time:

@@ -20,7 +20,7 @@ import numpy as np
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import body_rate
 from eskf_ros.filter.inertial.strapdown import gravity_map
-from eskf_ros.filter.measurements.gnss_position import noise_factor
+from eskf_ros.filter.integrity.scatter import NOTABLE_SCATTER
 from eskf_ros.filter.measurements.gnss_velocity import predict
 from eskf_ros.filter.state.enums import Stream, Verdict
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, SOURCES, VELOCITY
@@ -268,8 +268,8 @@ def watch_fix(state, aid):
         state.receiver.coasts += 1
         state.receiver.coast_nis += min(aid.nis / 3.0, NIS_CLIP**2)
     state.receiver.seen_stamp[source] = state.stamp
-    factor = noise_factor(state, source)
-    if factor > 1.0:
+    factor = state.scatter.spread[source]
+    if factor > NOTABLE_SCATTER:
         state.receiver.scattered_fixes[source] += 1
         state.receiver.scatter_sum[source] += factor
 

@@ -99,7 +99,7 @@ def _covariance_complaints(state: np.void, source: int, scale: float) -> list[st
             f"the fixes{_of(source)} scatter {math.sqrt(factor):.1f} times as much as they claim ({scattered} of "
             f"{count}): set gnss.covariance_scale to {factor * scale:.2g}, or gnss.position_std_floor"
         ]
-    share = math.sqrt(float(state["scatter"]["ratio"][0, source]))
+    share = math.sqrt(float(state["scatter"]["change"][source]))
     if share < MODEST_SCATTER:
         return [
             f"the fixes{_of(source)} scatter {share:.2f} times as much as they claim: they are better than that "

@@ -29,8 +29,8 @@ NO_ALTITUDE = 9
 UNKNOWN_ALTITUDE_VARIANCE = 1e8
 """m2; of the altitude that stands in for one that is missing: 10 km, which tells the filter nothing."""
 
-NOTABLE_SCATTER = 2.0
-"""Ratio of the scatter of fixes to the variance they claim above which their noise is inflated."""
+LEAST_WHITE = 0.02
+"""Least share of the claimed variance that is taken for new with every fix."""
 
 
 @njit
@@ -70,25 +70,26 @@ def fill_altitude(state, payload, source, settings):
 
 
 @njit
-def noise_factor(state, source):
-    """Return the factor on the covariances of a receiver's fixes that their scatter demands (see `receiver`)."""
-    ratio = state.scatter.ratio[0, source]
-    return ratio if ratio > NOTABLE_SCATTER else 1.0
+def noise_shares(state, source, settings):
+    """Return the variance of fixes that is new with each fix, and the one that lasts, over what they claim."""
+    if settings.correlated_share > 0.0:
+        return 1.0 - settings.correlated_share, settings.correlated_share
+    return max(state.scatter.white[source], LEAST_WHITE), state.scatter.lasting[source]
 
 
 @njit
-def add_lasting_error(state, settings, work):
-    """Move the correlated share of the noise to its augmented states, if they are active."""
+def split_noise(state, source, settings, work):
+    """Scale the noise of a fix in ``work`` to the share that is new; give the lasting one to its augmented states."""
+    white, lasting = noise_shares(state, source, settings)
     place = settings.position_error_at
-    if place >= state.error_size:
-        return
-    for i in range(SIZE):
-        std = math.sqrt(settings.correlated_share * work.noise[i, i])
-        work.jacobian[i, place + i] = std
-        work.innovation[i] -= std * state.optional[place - ERROR_SIZE + i]
+    if lasting > 0.0 and place < state.error_size:
+        for i in range(SIZE):
+            std = math.sqrt(lasting * work.noise[i, i])
+            work.jacobian[i, place + i] = std
+            work.innovation[i] -= std * state.optional[place - ERROR_SIZE + i]
     for i in range(SIZE):
         for j in range(SIZE):
-            work.noise[i, j] *= 1.0 - settings.correlated_share
+            work.noise[i, j] *= white
 
 
 @njit
@@ -101,11 +102,7 @@ def linearize(state, payload, source, settings, work):
         work.innovation[i] = measured[i] - predicted[i]
     set_identity(work.jacobian, POSITION)
     set_east_north_up_covariance(work.noise, state, east_north_up_to_ecef(payload[0], payload[1]), payload, 3)
-    factor = noise_factor(state, source)
-    for i in range(SIZE):
-        for j in range(SIZE):
-            work.noise[i, j] *= factor
-    add_lasting_error(state, settings, work)
+    split_noise(state, source, settings, work)
     lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[source])
     if state.heading_known == 0:
         # The lever arm points anywhere around the vertical: its horizontal length is an error of the prediction.
@@ -136,7 +133,7 @@ def augmented(parameters: Any) -> tuple[OptionalBlock, ...]:
             std=1.0,
             noise_density=math.sqrt(2.0 / time) if time else 0.0,
             correlation_time=time,
-            streams=(Stream.GNSS_POSITION,),
+            streams=(Stream.GNSS_POSITION,) if parameters.gnss.correlated_share > 0.0 else (),
         ),
     )
 

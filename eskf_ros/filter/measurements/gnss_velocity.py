@@ -37,8 +37,8 @@ NOTABLE_SCATTER = 2.0
 
 @njit
 def noise_factor(state, source):
-    """Return the factor on the covariances of a receiver's velocities that their scatter demands (see `receiver`)."""
-    ratio = state.scatter.ratio[1, source]
+    """Return the factor on the covariances of a receiver's velocities that their scatter demands (see `integrity.scatter`)."""
+    ratio = state.scatter.velocity[source]
     return ratio if ratio > NOTABLE_SCATTER else 1.0
 
 
