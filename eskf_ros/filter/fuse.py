@@ -12,8 +12,9 @@ from eskf_ros.filter.history.timeline import open_record
 from eskf_ros.filter.inertial.navigation_frame import heading_of
 from eskf_ros.filter.integrity.heading_monitor import watch_course, watch_field, watch_heading
 from eskf_ros.filter.integrity.humble_lane import kind_of
+from eskf_ros.filter.integrity.installation_monitor import find_faults, learn_faults
 from eskf_ros.filter.integrity.receiver import fuse_receiver, reset_for_new_solution
-from eskf_ros.filter.integrity.receiver_monitor import watch_aid
+from eskf_ros.filter.integrity.receiver_monitor import watch_receiver
 from eskf_ros.filter.integrity.recovery import note, recover
 from eskf_ros.filter.measurements import (
     baro,
@@ -97,7 +98,10 @@ def offer(states, aid, heading_before, settings, work):
         aid.verdict, aid.nis = update(state, size, gate, work)
         recover(state, aid, settings, work)
     if aid.verdict != Verdict.BAD_COVARIANCE:
-        watch_aid(state, aid, size, gate, work, settings)
+        learn_faults(state, aid, size, gate, work, settings)
+        find_faults(state, work)
+        if kind_of(aid.stream) >= 0:
+            watch_receiver(state, aid, work, settings)
     if aid.verdict == Verdict.FUSED and state.heading_known == 0:
         search_heading(state, aid, gate, settings, work)
     if aid.stream == Stream.GNSS_POSITION:

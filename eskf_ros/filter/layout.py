@@ -20,6 +20,7 @@ from eskf_ros.filter.inertial.strapdown import IMU_READINGS
 from eskf_ros.filter.integrity.heading_monitor import HEADING_MONITOR
 from eskf_ros.filter.integrity.humble_lane import TRUST
 from eskf_ros.filter.integrity.imu_monitor import IMU_MONITOR
+from eskf_ros.filter.integrity.installation_monitor import FAULTS, INSTALLATION
 from eskf_ros.filter.integrity.receiver_monitor import RECEIVER_MONITOR
 from eskf_ros.filter.integrity.recovery import RECOVERY
 from eskf_ros.filter.integrity.scatter import SCATTER
@@ -88,6 +89,7 @@ STATE = np.dtype(
         ("recovery", RECOVERY),
         ("trust", TRUST),
         ("receiver", RECEIVER_MONITOR),
+        ("installation", INSTALLATION),
         ("mag", EARTH_FIELD),
         ("tight", TIGHT),
         ("streams", STREAMS),
@@ -114,6 +116,7 @@ SETTINGS = np.dtype(
         ("imu_position_base", "f8", (3,)),
         ("lever_arms_body", "f8", (SOURCES, 3)),
         ("gnss_time_offset", "f8", (SOURCES,)),
+        ("velocity_time_offset", "f8"),
         ("solves_ranges", "i8"),
         ("gnss_covariance_scale", "f8"),
         ("correlated_share", "f8"),
@@ -169,7 +172,8 @@ WORK = np.dtype(
         ("jacobian", "f8", (3, ERROR_CAPACITY)),
         ("innovation", "f8", (3,)),
         ("noise", "f8", (3, 3)),
-        ("effect", "f8", (3, 4)),
+        ("effect", "f8", (3, FAULTS)),
+        ("fault_covariance", "f8", (FAULTS, FAULTS)),
         ("shared", "f8", (3, ERROR_CAPACITY)),
         ("projected", "f8", (3, ERROR_CAPACITY)),
         ("innovation_covariance", "f8", (3, 3)),
@@ -200,7 +204,8 @@ WORK = np.dtype(
 - ``jacobian``, ``innovation``, ``noise``: the measurement to fuse; ``shared``: covariance of its noise with the errors,
   zero unless the measurement writes it.
 - ``projected`` ... ``correction``: intermediate results of the update.
-- ``effect``: derivative of the measurement by the faults of its receiver (`receiver_monitor`).
+- ``effect``, ``fault_covariance``: derivative of the measurement by the faults of its receiver, and the covariance of
+  these (`installation_monitor`).
 - ``signal_*`` ... ``step``: the signals of one epoch and their least squares.
 """
 
@@ -220,6 +225,7 @@ _NEVER = {
     ),
     "trust": ("doubt_stamp",),
     "scatter": ("last_stamp",),
+    "installation": ("stamp", "checked"),
     "mag": ("disturbed_stamp",),
     "heading": ("given_stamp",),
     "rest": (
@@ -237,7 +243,6 @@ _NEVER = {
         "fused_since",
     ),
     "receiver": (
-        "fault_stamp",
         "departure_stamp",
         "seen_stamp",
         "heading_mark_stamp",

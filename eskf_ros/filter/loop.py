@@ -7,6 +7,7 @@ from eskf_ros.filter.alignment.levelling import update_level
 from eskf_ros.filter.fuse import fuse
 from eskf_ros.filter.history.timeline import rewind, save_checkpoint
 from eskf_ros.filter.inertial.navigation_frame import heading_of
+from eskf_ros.filter.inertial.strapdown import SMOOTHING_TIME
 from eskf_ros.filter.integrity.imu_monitor import watch_input
 from eskf_ros.filter.integrity.restart import reset_alignment
 from eskf_ros.filter.output.global_odometry import write_odometry
@@ -96,7 +97,11 @@ def take_sample(state, sample):
     state.imu.stamp = sample.stamp
     state.stamp = sample.stamp
     state.imu_next += 1
+    # No weight above one: the first reading, and the one after a gap, stand for themselves.
+    weight = min(1.0, state.imu.interval / SMOOTHING_TIME)
     for i in range(3):
+        state.imu.smooth_force[i] += weight * (sample.specific_force[i] - state.imu.smooth_force[i])
+        state.imu.smooth_rate[i] += weight * (sample.angular_rate[i] - state.imu.smooth_rate[i])
         state.imu.earlier_force[i] = state.imu.force[i]
         state.imu.earlier_rate[i] = state.imu.rate[i]
         state.imu.force[i] = sample.specific_force[i]

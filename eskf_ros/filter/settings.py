@@ -88,6 +88,7 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
     first = parameters.ranges if solves_ranges else parameters.gnss
     settings["solves_ranges"] = solves_ranges
     settings["gnss_time_offset"] = (first.time_offset, parameters.second_gnss.time_offset)
+    settings["velocity_time_offset"] = parameters.gnss.velocity_time_offset
     settings["lever_arms_body"] = lever_arms_base @ imu_to_base
     for row in ROWS:
         settings["gate"][0, row.stream, 1:] = chdtri([1, 2, 3], 1.0 - gate_probability(row, parameters))

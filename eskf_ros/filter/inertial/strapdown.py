@@ -33,10 +33,18 @@ IMU_READINGS = np.dtype(
         ("rate", "f8", (3,)),
         ("earlier_force", "f8", (3,)),
         ("earlier_rate", "f8", (3,)),
+        ("smooth_force", "f8", (3,)),
+        ("smooth_rate", "f8", (3,)),
     ],
     align=True,
 )
-"""The last raw IMU reading (m/s2, rad/s), its stamp, the interval (s) that it ended, and the reading before."""
+"""The last raw IMU reading (m/s2, rad/s), its stamp, the interval (s) that it ended, and the reading before.
+
+``smooth_force``, ``smooth_rate``: readings without vibration, averaged over about `SMOOTHING_TIME`.
+"""
+
+SMOOTHING_TIME = 0.25
+"""s; time constant of the smoothed readings: slower than vibration, faster than a vehicle turns."""
 
 
 @njit

@@ -205,17 +205,23 @@ def reset_jumped_error(states, settings, work):
 
 @njit
 def is_expected(state, aid, gate, settings, work):
-    """Say whether the filter itself expects a message: it is within its innovation gate."""
+    """Say whether the filter itself expects a message: it is within its innovation gate, or close."""
     size = linearize(state, aid, settings, work)
     nis, determinant = judge(state, size, work)
-    return determinant > 0.0 and nis <= gate
+    return determinant > 0.0 and (nis <= gate or is_small(kind_of(aid.stream), work))
 
 
 @njit
 def is_jump(nis, kind, work):
     """Say whether the innovation in ``work`` is impossible, and larger than the errors that receivers do not claim."""
+    return not nis <= JUMP_GATE and not is_small(kind, work)
+
+
+@njit
+def is_small(kind, work):
+    """Say whether the innovation in ``work`` is within the errors that receivers do not claim."""
     x, y, z = work.innovation[0], work.innovation[1], work.innovation[2]
-    return not nis <= JUMP_GATE and x * x + y * y + z * z > LEAST_JUMP[kind] ** 2
+    return x * x + y * y + z * z <= LEAST_JUMP[kind] ** 2
 
 
 @njit

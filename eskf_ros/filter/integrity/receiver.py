@@ -27,6 +27,7 @@ from eskf_ros.filter.integrity.recovery import note, note_reset
 from eskf_ros.filter.integrity.scatter import (
     copy_scatter,
     forget_scatter,
+    learn_from_change,
     learn_from_fix,
     learn_from_velocity,
     update_shares,
@@ -73,6 +74,9 @@ def fuse_receiver(states, aid, gate, settings, work):
             reset_to_humble_lane(states)
         if humble.heading_known == 0:
             heard = False
+        elif jumps and aid.stream == Stream.GNSS_POSITION:
+            learn_from_change(state, aid.source, settings, work)
+            update_shares(state, humble, aid.source, settings, work)
         elif not jumps:
             learn(state, humble, aid, humble_nis, settings, work)
     size = linearize(state, aid, settings, work)

@@ -7,16 +7,12 @@ import math
 import numpy as np
 from scipy.special import chdtri
 
+from eskf_ros.filter.integrity.installation_monitor import POSITION_TIME, VELOCITY_TIME
 from eskf_ros.filter.integrity.receiver_monitor import (
-    FAULT_PRIOR,
-    FAULT_SIGMAS,
     FEW_DEPARTURES,
     HIGH_NIS,
-    LEVER_ARM_ERROR,
     MANY_FIXES,
     MODEST_SCATTER,
-    TIME,
-    TIME_ERROR,
     UNLIKELY,
 )
 from eskf_ros.filter.state.error_state import SOURCES
@@ -48,47 +44,36 @@ def _of(source: int) -> str:
     return "" if source == 0 else " of the second receiver"
 
 
-def estimated_faults(state: np.void, source: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return lever arm error (m, body) and time offset (s), true minus configured, and their sigmas: (4,) each.
-
-    Innovations and a scatter that are larger than expected widen the sigmas.
-    """
-    scattered = max(1, int(state["receiver"]["scattered_fixes"][source]))
-    excess = max(
-        1.0,
-        float(state["receiver"]["velocity_nis"][source, 0]),
-        float(state["receiver"]["scatter_sum"][source]) / scattered,
-    )
-    information = state["receiver"]["fault_information"][source] + np.diag(1.0 / np.square(FAULT_PRIOR))
-    covariance = np.linalg.inv(information) * excess
-    estimate = np.linalg.solve(information, state["receiver"]["fault_evidence"][source])
-    return estimate, np.sqrt(np.diagonal(covariance))
-
-
 def _fault_complaints(state: np.void, settings: np.void, source: int) -> list[str]:
-    estimate, sigma = estimated_faults(state, source)
-    significance = np.abs(estimate) / sigma
-    # A large fault leaks into the estimates of the others.
-    certain = significance > max(FAULT_SIGMAS, 0.3 * significance.max())
+    found, sigma = state["installation"]["found"][source], state["installation"]["sigma"][source]
     group = "gnss" if source == 0 else "second_gnss"
     clock = "ranges" if source == 0 and settings["solves_ranges"] else group
-    found = []
-    if certain[TIME] and abs(estimate[TIME]) > TIME_ERROR:
-        right = float(settings["gnss_time_offset"][source]) + estimate[TIME]
-        found.append(
-            f"the fixes{_of(source)} are stamped {abs(estimate[TIME]):.3f} s (+- {sigma[TIME]:.3f}) "
-            f"{'late' if estimate[TIME] < 0.0 else 'early'}: set {clock}.time_offset to {right:.3f}, or synchronise "
+    texts = []
+    at_position, at_velocity = float(found[POSITION_TIME]), float(found[VELOCITY_TIME])
+    both = at_position and at_velocity and abs(at_position - at_velocity) < 0.5 * abs(at_position)
+    if at_position:
+        what = "fixes" if both or not at_velocity else "positions"
+        right = float(settings["gnss_time_offset"][source]) + at_position
+        texts.append(
+            f"the {what}{_of(source)} are stamped {abs(at_position):.3f} s (+- {sigma[POSITION_TIME]:.3f}) "
+            f"{'late' if at_position < 0.0 else 'early'}: set {clock}.time_offset to {right:.3f}, or synchronise "
             "the clocks"
         )
-    arm = estimate[:TIME] * certain[:TIME]
-    if np.abs(arm).max() > LEVER_ARM_ERROR:
-        x, y, z = (float(value) for value in settings["imu_to_base"] @ arm)
-        found.append(
-            f"the antenna{_of(source)} seems to be ({x:+.2f}, {y:+.2f}, {z:+.2f}) m "
-            f"(+- {sigma[:TIME][certain[:TIME]].max():.2f}) in base_link from where {group}.lever_arm says: measure it "
-            "again"
+    if at_velocity and not both:
+        right = float(settings["velocity_time_offset"]) + at_velocity - at_position
+        texts.append(
+            f"the velocities{_of(source)} are stamped {abs(at_velocity):.3f} s (+- {sigma[VELOCITY_TIME]:.3f}) "
+            f"{'late' if at_velocity < 0.0 else 'early'}: set gnss.velocity_time_offset to {right:.3f}"
         )
-    return found
+    arm = found[:POSITION_TIME]
+    if np.any(arm):
+        x, y, z = (float(value) for value in settings["imu_to_base"] @ arm)
+        texts.append(
+            f"the antenna{_of(source)} seems to be ({x:+.2f}, {y:+.2f}, {z:+.2f}) m "
+            f"(+- {sigma[:POSITION_TIME][arm != 0.0].max():.2f}) in base_link from where {group}.lever_arm says: "
+            "measure it again"
+        )
+    return texts
 
 
 def _covariance_complaints(state: np.void, source: int, scale: float) -> list[str]:

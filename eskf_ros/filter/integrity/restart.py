@@ -23,9 +23,10 @@ def reset_alignment(state):
     state.window.still_stamp = NEVER
     state.window.still_samples = 0
     # The faults of the receivers were learnt with an attitude that is not trusted any more.
-    state.receiver.fault_stamp = NEVER
-    state.receiver.fault_information.fill(0.0)
-    state.receiver.fault_evidence.fill(0.0)
+    state.installation.stamp = NEVER
+    state.installation.information.fill(0.0)
+    state.installation.evidence.fill(0.0)
+    state.installation.found.fill(0.0)
     for i in range(2):
         state.tight.clock_known[i] = 0
     for i in range(3):

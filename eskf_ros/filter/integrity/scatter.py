@@ -12,6 +12,7 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.integrity.installation_monitor import unmodelled_position
 from eskf_ros.filter.measurements.gnss_position import LEAST_WHITE, noise_shares
 from eskf_ros.filter.measurements.gnss_velocity import noise_factor
 from eskf_ros.filter.state.augmented_states import reset_augmented, update_error_size
@@ -106,15 +107,22 @@ def learn_from_velocity(state, source, nis):
 
 @njit
 def learn_from_fix(state, lane, source, settings, work):
-    """Learn from a fix in the humble ``lane`` how fixes scatter.
+    """Learn from a fix in the humble ``lane`` how far fixes are from the path, and how they change."""
+    used, _ = noise_shares(state, source, settings)
+    away = distance_from_path(lane, source, settings, work)
+    state.scatter.spread[source] = running_mean(state.scatter.spread[source], used * away, SPREAD_GAIN)
+    learn_from_change(state, source, settings, work)
 
-    ``work`` holds its innovation, and the inverse of the innovation covariance, which that of the fix before has, too:
+
+@njit
+def learn_from_change(state, source, settings, work):
+    """Learn how fixes change from one to the next; those that are refused count, too.
+
+    ``work`` holds the innovation, and the inverse of the innovation covariance, which that of the fix before has, too:
     the innovations of a humble lane are nearly independent.
     """
     scatter = state.scatter
     used, _ = noise_shares(state, source, settings)
-    away = distance_from_path(lane, source, settings, work)
-    scatter.spread[source] = running_mean(scatter.spread[source], used * away, SPREAD_GAIN)
     change = 0.0
     for a in range(3):
         for b in range(3):
@@ -157,12 +165,15 @@ def update_shares(state, lane, source, settings, work):
     found = max(spread if spread > NOTABLE_SCATTER else 1.0, scatter.white[source]) - scatter.white[source]
     if found < LEAST_LASTING:
         found = 0.0
+    off = unmodelled_position(state, source)
+    claimed = (work.noise[0, 0] + work.noise[1, 1]) / (2.0 * max(used, LEAST_WHITE))
+    found = max(found, min(off * off / claimed, LARGEST_SPREAD))
     lasting = scatter.lasting[source]
     found = max(found, lasting * largest_square(state, settings.position_error_at) / LARGEST_VALUE**2)
     if found > STEADY * lasting or found * STEADY < lasting:
         scatter.lasting[source] = found
         if found > 0.0:
-            factor = found / max(used, LEAST_WHITE) if change < NOTABLE_CALM else 0.0
+            factor = found / max(used, LEAST_WHITE) if change < NOTABLE_CALM or off > 0.0 else 0.0
             inflate_lasting_error(state, lasting, found, factor, settings, work)
             inflate_lasting_error(lane, lasting, found, factor, settings, work)
 

@@ -1,0 +1,243 @@
+"""Installation monitor: lever arms and time offsets that are wrong, found from innovations.
+
+The antenna is R dl + v dt away from where the filter expects it. The effect of such a fault on the state is carried
+through every prediction and update, and the innovations are compared with what remains of it (Friedland, Treatment of
+bias in recursive filtering, 1969). What is found is allowed for: as a lasting error of the fixes (`scatter`).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.inertial.strapdown import gravity_map
+from eskf_ros.filter.measurements.kalman_update import invert_positive
+from eskf_ros.filter.state.enums import Stream, Verdict
+from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, SOURCES, VELOCITY
+from eskf_ros.filter.state.time import NEVER, SECOND
+from eskf_ros.geodesy.rotation import cross, rotate, rotate_back, to_matrix
+
+FAULTS = 5
+"""Faults that are estimated for each receiver: three axes of the lever arm (m, body), and the time offsets (s) of
+positions and of velocities."""
+
+POSITION_TIME = 3
+"""Index of the time offset of positions among the faults."""
+
+VELOCITY_TIME = 4
+"""Index of the time offset of velocities among the faults."""
+
+MEMORY = 600.0
+"""s; time constant with which the normal equations of the faults forget."""
+
+FAULT_PRIOR = (5.0, 5.0, 5.0, 1.0, 1.0)
+"""Prior standard deviations of the faults (m, m, m, s, s)."""
+
+FAULT_SIGMAS = 6.0
+"""Standard deviations from zero beyond which a fault is reported."""
+
+LEVER_ARM_ERROR = 0.05
+"""m; smaller errors of the lever arm are not reported."""
+
+TIME_ERROR = 0.01
+"""s; smaller time offsets are not reported."""
+
+LEAKAGE = 0.3
+"""Share of the significance of the most certain fault above which another is certain, too."""
+
+CHECK_INTERVAL = 5 * SECOND
+"""ns; time between two looks at the estimated faults."""
+
+INSTALLATION = np.dtype(
+    [
+        ("stamp", "i8"),
+        ("force", "f8", (3,)),
+        ("absorbed", "f8", (SOURCES, ERROR_SIZE, FAULTS)),
+        ("information", "f8", (SOURCES, FAULTS, FAULTS)),
+        ("evidence", "f8", (SOURCES, FAULTS)),
+        ("checked", "i8"),
+        ("found", "f8", (SOURCES, FAULTS)),
+        ("sigma", "f8", (SOURCES, FAULTS)),
+    ],
+    align=True,
+)
+"""Estimation of the faults of the installation, by receiver.
+
+- ``stamp``, ``force``: stamp (ns) and specific force (m/s2, map) of its last step.
+- ``absorbed``: derivative of the 15 errors of the core by the faults.
+- ``information``, ``evidence``: normal equations of the faults.
+- ``checked``: when they were solved last (ns).
+- ``found``, ``sigma``: faults that are certain, true minus configured, else 0, and their standard deviations.
+"""
+
+
+@njit
+def write_effect(state, aid, work, settings):
+    """Write the derivative of a measurement by the faults of its receiver to ``work.effect`` (3, 5).
+
+    It is zero for all streams but GNSS position and velocity.
+    """
+    effect = work.effect
+    for i in range(3):
+        for k in range(FAULTS):
+            effect[i, k] = 0.0
+    rotation = to_matrix(state.attitude)
+    if aid.stream == Stream.GNSS_POSITION:
+        rate = smoothed_rate(state, rotation)
+        turning = rotate(rotation, cross(rate, settings.lever_arms_body[aid.source]))
+        for i in range(3):
+            for k in range(3):
+                effect[i, k] = rotation[i][k]
+            effect[i, POSITION_TIME] = state.velocity_map[i] + turning[i]
+    elif aid.stream == Stream.GNSS_VELOCITY:
+        rate = smoothed_rate(state, rotation)
+        force, bias = state.imu.smooth_force, state.accel_bias
+        felt = rotate(rotation, (force[0] - bias[0], force[1] - bias[1], force[2] - bias[2]))
+        gravity = gravity_map(state, (state.position_map[0], state.position_map[1], state.position_map[2]))
+        x = rotate(rotation, cross(rate, (1.0, 0.0, 0.0)))
+        y = rotate(rotation, cross(rate, (0.0, 1.0, 0.0)))
+        z = rotate(rotation, cross(rate, (0.0, 0.0, 1.0)))
+        for i in range(3):
+            effect[i, 0], effect[i, 1], effect[i, 2] = x[i], y[i], z[i]
+            effect[i, VELOCITY_TIME] = felt[i] + gravity[i]
+
+
+@njit
+def learn_faults(state, aid, size, gate, work, settings):
+    """Carry the effect of the faults on the state through one update, and learn from its innovation."""
+    if state.heading_known == 0 or state.doubt > 0.0 or aid.verdict == Verdict.RESET:
+        # Nothing is learnt from an estimate that is not trusted, and what was learnt just before it goes.
+        state.installation.stamp = NEVER
+        return
+    if state.installation.stamp == NEVER:
+        state.installation.absorbed.fill(0.0)
+    dt = carry_absorbed(state)
+    accepted = aid.verdict in (Verdict.FUSED, Verdict.WEIGHED_DOWN, Verdict.TAKEOVER)
+    for source in range(SOURCES):
+        absorbed = state.installation.absorbed[source]
+        write_effect(state, aid, work, settings)
+        effect = work.effect
+        is_own = source == aid.source and aid.stream in (Stream.GNSS_POSITION, Stream.GNSS_VELOCITY)
+        for a in range(size):
+            for k in range(FAULTS):
+                if not is_own:
+                    effect[a, k] = 0.0
+                for i in range(ERROR_SIZE):
+                    effect[a, k] -= work.jacobian[a, i] * absorbed[i, k]
+        if is_own:
+            weigh_faults(state, source, dt, min(1.0, gate / max(aid.nis, 1e-9)), work)
+        if accepted:
+            for i in range(ERROR_SIZE):
+                for k in range(FAULTS):
+                    for a in range(size):
+                        absorbed[i, k] += work.gain[i, a] * effect[a, k]
+
+
+@njit
+def smoothed_rate(state, rotation):
+    """Return the rate of the body relative to the Earth (rad/s, IMU axes), without vibration and single noise.
+
+    A rate that carries the noise of the very sample that predicts the measurement would explain its own innovation.
+    """
+    earth, rate, bias = rotate_back(rotation, state.frame.earth_rate_map), state.imu.smooth_rate, state.gyro_bias
+    return (rate[0] - bias[0] - earth[0], rate[1] - bias[1] - earth[1], rate[2] - bias[2] - earth[2])
+
+
+@njit
+def carry_absorbed(state):
+    """Carry the effect of the faults on the state to the present; return the time (s) since the last measurement.
+
+    One step of the trapezoidal rule: exact enough for a second of a car's motion, and the fault estimates tolerate
+    more.
+    """
+    rotation = to_matrix(state.attitude)
+    f, b = state.specific_force, state.accel_bias
+    force = rotate(rotation, (f[0] - b[0], f[1] - b[1], f[2] - b[2]))
+    dt = 0.0 if state.installation.stamp == NEVER else (state.stamp - state.installation.stamp) * 1e-9
+    last = state.installation.force
+    mean = (0.5 * (force[0] + last[0]), 0.5 * (force[1] + last[1]), 0.5 * (force[2] + last[2]))
+    for source in range(SOURCES):
+        a = state.installation.absorbed[source]
+        for k in range(FAULTS):
+            turning = rotate(rotation, (a[GYRO_BIAS, k], a[GYRO_BIAS + 1, k], a[GYRO_BIAS + 2, k]))
+            pulling = rotate(rotation, (a[ACCEL_BIAS, k], a[ACCEL_BIAS + 1, k], a[ACCEL_BIAS + 2, k]))
+            tilt = (
+                a[ATTITUDE, k] - 0.5 * dt * turning[0],
+                a[ATTITUDE + 1, k] - 0.5 * dt * turning[1],
+                a[ATTITUDE + 2, k] - 0.5 * dt * turning[2],
+            )
+            pushing = cross(tilt, mean)
+            for i in range(3):
+                gain = dt * (pushing[i] - pulling[i])
+                a[POSITION + i, k] += dt * (a[VELOCITY + i, k] + 0.5 * gain)
+                a[VELOCITY + i, k] += gain
+                a[ATTITUDE + i, k] -= dt * turning[i]
+    state.installation.stamp = state.stamp
+    for i in range(3):
+        state.installation.force[i] = force[i]
+    return dt
+
+
+@njit
+def weigh_faults(state, source, dt, weight, work):
+    """Add one innovation to the normal equations of the faults; ``work.innovation_covariance`` is inverted already.
+
+    ``dt`` (s): the time since the last measurement; ``weight``: below 1 for an innovation outside the gate.
+    """
+    inverse, effect = work.innovation_covariance, work.effect
+    remains = max(0.0, 1.0 - dt / MEMORY)
+    for k in range(FAULTS):
+        state.installation.evidence[source, k] *= remains
+        for m in range(FAULTS):
+            state.installation.information[source, k, m] *= remains
+        for a in range(3):
+            spread = 0.0
+            for b in range(3):
+                spread += effect[b, k] * inverse[b, a]
+            state.installation.evidence[source, k] += weight * spread * work.innovation[a]
+            for m in range(FAULTS):
+                state.installation.information[source, k, m] += weight * spread * effect[a, m]
+
+
+@njit
+def find_faults(state, work):
+    """Solve the normal equations every `CHECK_INTERVAL`, and note which faults are certain.
+
+    Innovations and a scatter that are larger than expected widen the standard deviations. A large fault leaks into the
+    estimates of the others.
+    """
+    if state.stamp - state.installation.checked < CHECK_INTERVAL:
+        return
+    state.installation.checked = state.stamp
+    for source in range(SOURCES):
+        excess = max(1.0, max(state.scatter.velocity[source], state.scatter.spread[source]))
+        covariance = work.fault_covariance
+        for k in range(FAULTS):
+            for m in range(FAULTS):
+                covariance[k, m] = state.installation.information[source, k, m]
+            covariance[k, k] += 1.0 / FAULT_PRIOR[k] ** 2
+        if invert_positive(covariance, FAULTS) == 0.0:
+            continue
+        largest = 0.0
+        for k in range(FAULTS):
+            estimate = 0.0
+            for m in range(FAULTS):
+                estimate += covariance[k, m] * state.installation.evidence[source, m]
+            state.installation.found[source, k] = estimate
+            state.installation.sigma[source, k] = math.sqrt(covariance[k, k] * excess)
+            largest = max(largest, abs(estimate) / state.installation.sigma[source, k])
+        for k in range(FAULTS):
+            least = TIME_ERROR if k >= POSITION_TIME else LEVER_ARM_ERROR
+            estimate, sigma = state.installation.found[source, k], state.installation.sigma[source, k]
+            if abs(estimate) < max(FAULT_SIGMAS, LEAKAGE * largest) * sigma or abs(estimate) < least:
+                state.installation.found[source, k] = 0.0
+
+
+@njit
+def unmodelled_position(state, source):
+    """Return the length (m) by which fixes are off by what was found: wrong lever arm, positions at the wrong time."""
+    found, v = state.installation.found[source], state.velocity_map
+    way = found[POSITION_TIME] ** 2 * (v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
+    return math.sqrt(found[0] ** 2 + found[1] ** 2 + found[2] ** 2 + way)
