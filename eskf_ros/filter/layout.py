@@ -17,6 +17,7 @@ from eskf_ros.filter.alignment.heading_sensors import CANDIDATE
 from eskf_ros.filter.alignment.levelling import LEVELLING
 from eskf_ros.filter.inertial.navigation_frame import FRAME
 from eskf_ros.filter.inertial.strapdown import IMU_READINGS
+from eskf_ros.filter.integrity.heading_corrections import CORRECTIONS
 from eskf_ros.filter.integrity.heading_monitor import HEADING_MONITOR
 from eskf_ros.filter.integrity.humble_lane import TRUST
 from eskf_ros.filter.integrity.imu_monitor import IMU_MONITOR
@@ -88,6 +89,7 @@ STATE = np.dtype(
         ("heading_monitor", HEADING_MONITOR),
         ("recovery", RECOVERY),
         ("trust", TRUST),
+        ("corrections", CORRECTIONS),
         ("receiver", RECEIVER_MONITOR),
         ("installation", INSTALLATION),
         ("mag", EARTH_FIELD),
@@ -224,6 +226,7 @@ _NEVER = {
         "reset_stamp",
     ),
     "trust": ("doubt_stamp",),
+    "corrections": ("since",),
     "scatter": ("last_stamp",),
     "installation": ("stamp", "checked"),
     "mag": ("disturbed_stamp",),

@@ -331,14 +331,17 @@ def reset_block(lane, block):
 
 
 @njit
-def compare(states, aid, nis, log_determinant, humble_nis, humble_log_determinant, settings):
-    """Compare how well the lanes predicted a message; let the humble lane take over where the filter is wrong."""
+def compare(states, aid, drifts, nis, log_determinant, humble_nis, humble_log_determinant, settings):
+    """Compare how well the lanes predicted a message; let the humble lane take over where the filter is wrong.
+
+    ``drifts``: its heading has to be corrected to one side all the time. Returns whether it took over.
+    """
     state = states[FILTER]
     narrow_noise(state)
     if aid.stream == Stream.GNSS_VELOCITY or not is_live(state, Stream.GNSS_VELOCITY.value, aid.source):
         ratio = min(nis, LARGEST_NIS) + log_determinant - min(humble_nis, LARGEST_NIS) - humble_log_determinant
         state.trust.evidence = max(0.0, state.trust.evidence + 0.5 * ratio)
-    if state.trust.evidence < EVIDENCE and not is_heading_apart(states, settings):
+    if state.trust.evidence < EVIDENCE and not drifts and not is_heading_apart(states, settings):
         return False
     reset_to_humble_lane(states)
     return True

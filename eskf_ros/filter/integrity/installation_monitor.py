@@ -107,9 +107,11 @@ def write_effect(state, aid, work, settings):
 @njit
 def learn_faults(state, aid, size, gate, work, settings):
     """Carry the effect of the faults on the state through one update, and learn from its innovation."""
-    if state.heading_known == 0 or state.doubt > 0.0 or aid.verdict == Verdict.RESET:
-        # Nothing is learnt from an estimate that is not trusted, and what was learnt just before it goes.
+    if state.heading_known == 0 or aid.verdict in (Verdict.RESET, Verdict.TAKEOVER):
+        # What was learnt from an estimate that was wrong goes with it.
         state.installation.stamp = NEVER
+        state.installation.information.fill(0.0)
+        state.installation.evidence.fill(0.0)
         return
     if state.installation.stamp == NEVER:
         state.installation.absorbed.fill(0.0)

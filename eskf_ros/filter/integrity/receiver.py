@@ -13,6 +13,7 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.history.records import XX, YY
+from eskf_ros.filter.integrity.heading_corrections import HEADING, are_one_sided, forget_corrections
 from eskf_ros.filter.integrity.humble_lane import (
     compare,
     hear,
@@ -84,6 +85,7 @@ def fuse_receiver(states, aid, gate, settings, work):
         aid.innovation[k] = work.innovation[k]
     aid.dof = size
     aid.nis, determinant = judge(state, size, work)
+    heading_variance = state.covariance[HEADING, HEADING]
     if determinant == 0.0:
         aid.verdict = Verdict.BAD_COVARIANCE
     elif aid.nis <= gate:
@@ -102,11 +104,14 @@ def fuse_receiver(states, aid, gate, settings, work):
     else:
         aid.verdict = Verdict.GATE
     if heard and not jumps and not believed:
-        if compare(states, aid, aid.nis, math.log(determinant), humble_nis, humble_log, settings):
+        drifts = are_one_sided(state, heading_variance, work.correction[HEADING])
+        if compare(states, aid, drifts, aid.nis, math.log(determinant), humble_nis, humble_log, settings):
             aid.verdict = Verdict.TAKEOVER
     if believed:
         aid.verdict = Verdict.RESET
         note_reset(state)
+    if aid.verdict in (Verdict.RESET, Verdict.TAKEOVER):
+        forget_corrections(state)
     note(state, aid.stream, aid.source, aid.verdict)
 
 
