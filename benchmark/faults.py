@@ -236,8 +236,6 @@ def delayed(name: str, seconds: float) -> Exchange:
 
 
 FAULTS = (
-    Fault("RTK claims little and wanders 0.3 m", gnss=lasting(0.3, 60.0), parameters={"gnss.covariance_scale": 1e-2}),
-    Fault("honest lasting errors 1.5 m, 60 s", gnss=lasting(1.5, 60.0), parameters={"gnss.covariance_scale": 3.5}),
     Fault("clean"),
     Fault("gyro bias step 1 deg/s", added(rate=(0.0, 0.0, math.radians(1.0)))),
     Fault("accelerometer bias step 0.3 m/s2", added(force=(0.3, 0.0, 0.0))),

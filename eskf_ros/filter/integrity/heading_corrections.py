@@ -28,10 +28,10 @@ such sums, in standard deviations, to the left and to the right."""
 WINDOW = 5_000_000_000
 """ns; corrections are summed up over this time: errors of velocities last for a second or so."""
 
-ALLOWANCE = 2.0
+ALLOWANCE = 1.0
 """Standard deviations of each sum that count for nothing: receivers smooth their velocities."""
 
-LIMIT = 12.0
+LIMIT = 8.0
 """Standard deviations, the allowance taken off, from which on corrections go one way."""
 
 

@@ -28,6 +28,7 @@ from eskf_ros.filter.integrity.recovery import note, note_reset
 from eskf_ros.filter.integrity.scatter import (
     copy_scatter,
     forget_scatter,
+    forget_spread,
     learn_from_change,
     learn_from_fix,
     learn_from_velocity,
@@ -112,6 +113,7 @@ def fuse_receiver(states, aid, gate, settings, work):
         note_reset(state)
     if aid.verdict in (Verdict.RESET, Verdict.TAKEOVER):
         forget_corrections(state)
+        forget_spread(state)
     note(state, aid.stream, aid.source, aid.verdict)
 
 

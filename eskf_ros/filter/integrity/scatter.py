@@ -16,7 +16,9 @@ from eskf_ros.filter.integrity.installation_monitor import unmodelled_position
 from eskf_ros.filter.measurements.gnss_position import LEAST_WHITE, noise_shares
 from eskf_ros.filter.measurements.gnss_velocity import noise_factor
 from eskf_ros.filter.state.augmented_states import reset_augmented, update_error_size
+from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ERROR_SIZE, NOWHERE, POSITION, SOURCES
+from eskf_ros.filter.state.streams import is_live
 
 SCATTER = np.dtype(
     [
@@ -92,6 +94,13 @@ def forget_scatter(state, source):
 
 
 @njit
+def forget_spread(state):
+    """Forget how far fixes were from a path that was wrong."""
+    for source in range(SOURCES):
+        state.scatter.spread[source] = 1.0
+
+
+@njit
 def running_mean(mean, found, gain):
     """Return the running mean after a newest value, which is clipped."""
     found = min(found, SPREAD_CLIP * max(mean, 1.0))
@@ -109,8 +118,10 @@ def learn_from_velocity(state, source, nis):
 def learn_from_fix(state, lane, source, settings, work):
     """Learn from a fix in the humble ``lane`` how far fixes are from the path, and how they change."""
     used, _ = noise_shares(state, source, settings)
-    away = distance_from_path(lane, source, settings, work)
-    state.scatter.spread[source] = running_mean(state.scatter.spread[source], used * away, SPREAD_GAIN)
+    # Without velocities that confirm the path, the path may be wrong and not the fixes; so it may be in doubt.
+    if state.doubt == 0.0 and is_live(state, Stream.GNSS_VELOCITY.value, source):
+        away = distance_from_path(lane, source, settings, work)
+        state.scatter.spread[source] = running_mean(state.scatter.spread[source], used * away, SPREAD_GAIN)
     learn_from_change(state, source, settings, work)
 
 
