@@ -464,7 +464,7 @@ class Navigator(Readout):
             self._traffic.shut_doors[stream, Verdict(door)] += 1
         self._make_room()
         refused = offer_aid(
-            self._buffers.aids, self._buffers.timeline, self._offered, stamp, arrival, int(stream), source, door
+            self._buffers.aids, self._buffers.timeline, self._offered, stamp, arrival, int(stream), source, int(door)
         )
         if refused:
             self._refuse(stream, stamp, arrival, source, Verdict(refused))
