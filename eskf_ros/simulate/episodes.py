@@ -1,6 +1,7 @@
 """What goes wrong for a while: a flat list of episodes in any combination, applied in their order.
 
-Those that change what a GNSS receiver says are in `eskf_ros.simulate.gnss_episodes`.
+Those that change what a GNSS receiver says are in `eskf_ros.simulate.gnss_episodes` and `gnss_message_episodes`, those
+of the IMU in `eskf_ros.simulate.imu_episodes`.
 """
 
 from __future__ import annotations
@@ -34,6 +35,20 @@ class Outage(Episode):
     """
 
     receiver: int = field(default=0, kw_only=True)
+
+
+@dataclass(frozen=True)
+class ClockSet(Episode):
+    """The clock that stamps IMU and GNSS is set ahead by ``step`` (s; below zero back), and set right at the end.
+
+    Messages are recorded in the order in which they came, by a clock that was left alone.
+    """
+
+    step: float = -0.5
+
+    def shifts(self, elapsed: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return what is added (ns) to stamps of the times ``elapsed`` (s)."""
+        return np.where(self.covers(elapsed), round(self.step * 1e9), 0)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """A simulated GNSS receiver: position and velocity of the antenna at regular epochs, each with its covariance.
 
-The errors are white and exactly as the covariances say, unless episodes (`eskf_ros.simulate.gnss_episodes`) change
-that. Position and velocity of an epoch share the stamp; both arrive late by a latency that differs from epoch to epoch,
-the velocity shortly after the position.
+The errors are white and exactly as the covariances say, unless episodes (`eskf_ros.simulate.gnss_episodes` and
+`gnss_message_episodes`) change that. Position and velocity of an epoch share the stamp; both arrive late by a latency
+that differs from epoch to epoch, the velocity shortly after the position.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from eskf_ros.geodesy.map_frame import east_north_up_to_ecef, to_geodetic
 from eskf_ros.simulate.episodes import Episode, received
 from eskf_ros.simulate.gnss_episodes import GnssEpisode, GnssReport
+from eskf_ros.simulate.gnss_message_episodes import GnssMessageEpisode, changed_messages
 from eskf_ros.simulate.motion import Vector
 from eskf_ros.simulate.sampling import Interval, Section, Stamps, arrivals, check_rate, generators
 
@@ -89,7 +90,7 @@ class GnssReceiver:
         velocity_arrival = arrivals(fix_arrival, VELOCITY_AFTER_POSITION, streams.velocity_delay)
         # Outages only remove messages, so that what lies outside of them does not depend on them.
         kept = received(episodes, (receiver,), elapsed)
-        return GnssMeasurements(
+        said = GnssMeasurements(
             fix_stamp=stamp[kept],
             fix_arrival=fix_arrival[kept],
             fix_latitude_deg=geodetic[kept, 0],
@@ -103,6 +104,10 @@ class GnssReceiver:
             velocity_enu=velocity_enu[kept],
             velocity_covariance=_diagonal(report.reported_velocity_std[kept]),
         )
+        for episode in episodes:
+            if not isinstance(episode, GnssMessageEpisode) or episode.receiver in (0, receiver):
+                said = changed_messages(said, episode, streams.episodes)
+        return said
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.simulate.barometer import Barometer, BarometerMeasurements
 from eskf_ros.simulate.body_velocity import BodyVelocity, BodyVelocityMeasurements
 from eskf_ros.simulate.dual_antenna import DualAntenna, DualAntennaMeasurements
-from eskf_ros.simulate.episodes import Episode, MagneticDisturbance, Outage, WheelSlip
+from eskf_ros.simulate.episodes import ClockSet, Episode, MagneticDisturbance, Outage, WheelSlip
 from eskf_ros.simulate.gnss import GnssMeasurements, GnssReceiver
 from eskf_ros.simulate.gnss_episodes import (
     BadFixes,
@@ -25,7 +25,9 @@ from eskf_ros.simulate.gnss_episodes import (
     Spoofing,
     ZeroCovariance,
 )
+from eskf_ros.simulate.gnss_message_episodes import GNSS_MESSAGE_EPISODES, GnssMessageEpisode
 from eskf_ros.simulate.imu import grade_parameters
+from eskf_ros.simulate.imu_episodes import IMU_EPISODES
 from eskf_ros.simulate.magnetometer import Magnetometer, MagnetometerMeasurements
 from eskf_ros.simulate.motion import Vector
 from eskf_ros.simulate.range_episodes import RANGE_EPISODES
@@ -56,6 +58,9 @@ EPISODES = {
     "overconfidence": Overconfidence,
     "claimed_std": ClaimedStd,
     "zero_covariance": ZeroCovariance,
+    **GNSS_MESSAGE_EPISODES,
+    **IMU_EPISODES,
+    "clock_set": ClockSet,
     "wheel_slip": WheelSlip,
     "magnetic_disturbance": MagneticDisturbance,
     **RANGE_EPISODES,
@@ -78,8 +83,9 @@ class Options:
     `eskf_ros.simulate.gnss.GnssReceiver`. The sensors that are None are not there; ``ranges`` are those of the first
     receiver's antenna. ``outages``: intervals (first,
     last) in seconds from time zero without GNSS; None takes the scenario's. ``episodes``: what else goes wrong, see
-    `eskf_ros.simulate.episodes`, `eskf_ros.simulate.gnss_episodes` and `eskf_ros.simulate.range_episodes`. ``start``
-    and ``stop``: the part of the scenario that is recorded, in seconds from time zero; ``stop`` None is its end.
+    `eskf_ros.simulate.episodes`, `gnss_episodes`, `gnss_message_episodes`, `imu_episodes` and `range_episodes`.
+    ``start`` and ``stop``: the part of the scenario that is recorded, in seconds from time zero; ``stop`` None is its
+    end.
     """
 
     grade: str = "industrial"
@@ -119,7 +125,7 @@ class Options:
         for name in ("imu_rate", "gnss_rate", "truth_rate"):
             check_rate(name, getattr(self, name))
         for episode in self.episodes:
-            if isinstance(episode, (Outage, GnssEpisode)) and episode.receiver not in (0, 1, 2):
+            if isinstance(episode, (Outage, GnssEpisode, GnssMessageEpisode)) and episode.receiver not in (0, 1, 2):
                 raise ValueError(f"{episode}: the receiver must be 1, 2 or, for both, 0")
 
     @property
@@ -142,9 +148,10 @@ class Recording(GnssMeasurements):
     like these options, each with its ``sensor`` (where it is mounted), the true errors drawn for it, and None where
     there is no such sensor. The truth is of base_link: position and velocity in ``map`` (m, m/s), attitude as
     quaternion w x y z, ``truth_angular_rate_body`` relative to the Earth in base_link axes (rad/s). ``gyro_bias`` and
-    ``accel_bias`` (one row per IMU sample, IMU axes) are the true biases. ``datum``: latitude and longitude in degrees,
-    ellipsoidal altitude in m. Recordings of one scenario share the arrays that do not depend on the seed: do not write
-    to them.
+    ``accel_bias`` (one row per IMU sample, IMU axes) are the true biases, without episodes; ``imu_taken`` (int64 ns) is
+    when each sample was taken: ``imu_stamp``, unless an episode changes that. ``datum``: latitude and longitude in
+    degrees, ellipsoidal altitude in m. Recordings of one scenario share the arrays that do not depend on the seed: do
+    not write to them.
     """
 
     name: str
@@ -153,6 +160,7 @@ class Recording(GnssMeasurements):
     datum: Vector
     outages: tuple[Interval, ...]
     imu_stamp: Stamps
+    imu_taken: Stamps
     imu_arrival: Stamps
     specific_force: Array
     angular_rate: Array

@@ -37,6 +37,7 @@ class RandomStream(IntEnum):
     SECOND_GNSS = 9
     RANGES = 10
     VIBRATION = 11
+    IMU_EPISODES = 12
 
 
 @dataclass(frozen=True)

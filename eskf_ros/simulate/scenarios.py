@@ -159,6 +159,8 @@ _FLIGHT = (
     Leg(10.0),
 )
 
+_LONG_FLIGHT = (*_FLIGHT[:2], *(_FLIGHT[2:10] * 3), *_FLIGHT[10:])
+
 _CIRCUIT: tuple[FlightInstruction, ...] = (
     Hold(20.0),
     SpeedTo(30.0, 3.0),
@@ -298,6 +300,11 @@ SCENARIOS: dict[str, Scenario] = {
     "multirotor": Scenario(
         "take-off, hover, legs in all directions but forward, drifting in the wind, landing",
         lambda heading_deg: MultirotorTrajectory(_FLIGHT, heading_deg),
+        heading_deg=25.0,
+    ),
+    "long_flight": Scenario(
+        "the multirotor, five minutes of it",
+        lambda heading_deg: MultirotorTrajectory(_LONG_FLIGHT, heading_deg),
         heading_deg=25.0,
     ),
     "aeroplane": Scenario(

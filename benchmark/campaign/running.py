@@ -1,0 +1,171 @@
+"""One run of a fault: the drive, the filter, and its figures against the truth, once a second."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from campaign.fault import RATE, Fault, Filter
+from eskf_ros.filter.history.records import RECORD
+from eskf_ros.filter.navigator import Navigator
+from eskf_ros.filter.state.enums import SENSOR_STREAMS, Stream, Verdict
+from eskf_ros.parameters.mapping import from_mapping
+from eskf_ros.simulate.imu import ImuMount
+from eskf_ros.simulate.scenario import Recording, simulate
+from monte_carlo import NO_SIDE_SLIP, feed
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+IMU_NOISE = ("gyro_noise_density", "accel_noise_density", "gyro_bias_random_walk", "accel_bias_random_walk")
+"""Parameters that the told filter knows and the default one does not."""
+
+ASKED_EVERY = 5
+"""s between two looks at what the filter says."""
+
+KNOWN = math.radians(30.0)
+"""rad; a heading known to this must not be thrown away."""
+
+MOVES, TURNS = 0.05, math.radians(0.1)
+"""m/s and rad/s from which on rest is false."""
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What a run gave at n times, ``seconds`` (n,) from the start.
+
+    ``error``, ``sigma``: horizontal, m. ``heading_error``, ``heading_sigma``: rad; where the heading is not
+    ``is_known`` they say nothing. ``speed``, ``turn``: of the truth, m/s and rad/s. ``said``: sentences, with the time
+    (s) at which each was first seen, numbers left out. ``refused``: share of the measurements that no gate let in.
+    ``rest`` (m,): stamps at which rest was taken for granted (s), ``rest_speed`` and ``rest_turn`` the truth there.
+    """
+
+    seconds: Array
+    error: Array
+    sigma: Array
+    heading_error: Array
+    heading_sigma: Array
+    is_known: Mask
+    speed: Array
+    turn: Array
+    restarts: int
+    resets: int
+    thrown_away: int
+    said: dict[str, float]
+    offered: int
+    refused: int
+    rest: Array
+    rest_speed: Array
+    rest_turn: Array
+
+
+def without_gates(navigator: Navigator) -> None:
+    """Let a filter believe everything: its innovation gates are open, so it never resets a position nor restarts."""
+    navigator._settings["gate"][:] = 1e300
+
+
+def parameters_of(fault: Fault, recording: Recording, is_told: bool) -> dict[str, Any]:
+    """Parameters of the recording, changed by the fault; without the noise of the IMU where it is not told."""
+    parameters = {**recording.parameters(), **NO_SIDE_SLIP}
+    if not is_told:
+        parameters = {name: value for name, value in parameters.items() if name.removeprefix("imu.") not in IMU_NOISE}
+    for name, value in fault.parameters.items():
+        if isinstance(value, tuple):
+            before = parameters.get(name, (0.0, 0.0, 0.0))
+            value = tuple(float(a) + b for a, b in zip(before, value))
+        parameters[name] = value
+    return parameters
+
+
+def recording_of(fault: Fault, seed: int) -> Recording:
+    """Simulate the drive of a fault."""
+    options = {"imu_rate": RATE, "stop": fault.stop, "episodes": fault.episodes, **fault.options}
+    return simulate(fault.scenario, seed, **options)
+
+
+def run_one(fault: Fault, recording: Recording, given: Filter, has_gates: bool = True) -> Trace:
+    """Run a filter over the recording of a fault."""
+    if not given.has_velocity:
+        recording = dataclasses.replace(recording, velocity_stamp=recording.velocity_stamp[:0])
+    navigator = Navigator(from_mapping(parameters_of(fault, recording, given.is_told)))
+    if not has_gates:
+        without_gates(navigator)
+    start = int(recording.truth_stamp[0])
+    taken = (recording.imu_taken - start) * 1e-9
+    stops = np.unique(np.searchsorted(taken, np.arange(1.0, taken[-1])))
+    states, records, said = [], [], {}
+    for k, (_, state) in enumerate(feed(recording, navigator, stops)):
+        states.append(state.copy())
+        if k % ASKED_EVERY == 0:
+            records.append(navigator.take_records())
+            for sentence in sentences(navigator):
+                said.setdefault(sentence, float(taken[stops[k]]))
+    records.append(navigator.finish())
+    for sentence in sentences(navigator):
+        said.setdefault(sentence, float(taken[-1]))
+    return _trace(recording, navigator, stops, np.array(states), np.concatenate(records, dtype=RECORD), said)
+
+
+def sentences(navigator: Navigator) -> list[str]:
+    """What the filter says at present, numbers left out, so that one that grows is the same sentence."""
+    found = [*navigator.complaints, *navigator.notes]
+    return [" ".join("".join(" " if c.isdigit() else c for c in text).split()) for text in found]
+
+
+def _trace(
+    recording: Recording,
+    navigator: Navigator,
+    stops: NDArray[np.int64],
+    states: np.ndarray,
+    records: np.ndarray,
+    said: dict[str, float],
+) -> Trace:
+    truth = np.searchsorted(recording.truth_stamp, recording.imu_taken[stops])
+    truth = np.minimum(truth, len(recording.truth_stamp) - 1)
+    mount = ImuMount(recording.options.imu_position, recording.options.imu_rpy_deg)
+    body_to_map = Rotation.from_quat(recording.truth_attitude_body_to_map[truth][:, [1, 2, 3, 0]])
+    # At slow rates of the truth a stop may lie a moment before: the way of that moment does not count.
+    late = (recording.imu_taken[stops] - recording.truth_stamp[truth]) * 1e-9
+    position = recording.truth_position_map[truth] + late[:, None] * recording.truth_velocity_map[truth]
+    position = position + body_to_map.apply(mount.position)
+    imu_to_map = body_to_map * Rotation.from_matrix(mount.rotation_imu_to_body)
+    turn = (imu_to_map * Rotation.from_quat(states["attitude"][:, [1, 2, 3, 0]]).inv()).as_rotvec()
+    covariance = states["covariance"]
+    away = position - states["position_map"]
+    is_known = states["heading_known"].astype(bool)
+    sigma = np.sqrt(np.maximum(covariance[:, 8, 8], 1e-12))
+    was_known = is_known[:-1] & (sigma[:-1] < KNOWN)
+    rest = records[(records["stream"] == Stream.ZUPT) & (records["verdict"] == Verdict.FUSED)]["stamp"]
+    turning = records[(records["stream"] == Stream.ZARU) & (records["verdict"] == Verdict.FUSED)]["stamp"]
+    aids = records[(records["stream"] < SENSOR_STREAMS) & (records["dof"] > 0)]
+    speed = np.linalg.norm(recording.truth_velocity_map, axis=1)
+    rate = np.linalg.norm(recording.truth_angular_rate_body, axis=1)
+
+    def at(stamps: NDArray[np.int64], quantity: Array) -> Array:
+        return np.interp(stamps, recording.truth_stamp, quantity)
+
+    return Trace(
+        seconds=(recording.imu_taken[stops] - recording.truth_stamp[0]) * 1e-9,
+        error=np.hypot(away[:, 0], away[:, 1]),
+        sigma=np.sqrt(np.maximum(covariance[:, 0, 0] + covariance[:, 1, 1], 1e-12)),
+        heading_error=turn[:, 2],
+        heading_sigma=sigma,
+        is_known=is_known,
+        speed=speed[truth],
+        turn=rate[truth],
+        restarts=navigator.restarts,
+        resets=navigator.position_resets,
+        thrown_away=int(np.count_nonzero(was_known & ~is_known[1:])),
+        said=said,
+        offered=len(aids),
+        refused=int(np.count_nonzero(~np.isin(aids["verdict"], (Verdict.FUSED, Verdict.WEIGHED_DOWN)))),
+        rest=(rest - recording.truth_stamp[0]) * 1e-9,
+        rest_speed=at(rest, speed),
+        rest_turn=at(turning, rate),
+    )
