@@ -31,8 +31,9 @@ from rich.progress import track
 from campaign.fault import DEFAULT_POSITION, TOLD_VELOCITY, VEHICLES, Fault, Kind, with_vehicles
 from campaign.imu_faults import ROUGH, imu_faults
 from campaign.judge import HEADINGS, Figures, Row, figures_of, summary
+from campaign.motion_faults import motion_faults
 from campaign.receiver_faults import receiver_faults
-from campaign.running import recording_of, run_one
+from campaign.running import messages_with_heading, recording_of, run_one
 from campaign.settings_faults import settings_faults
 from markdown_table import table
 
@@ -49,6 +50,7 @@ def all_faults(amplitude: float = 1.0) -> list[Fault]:
             *imu_faults(amplitude),
             *settings_faults(amplitude),
             *receiver_faults(amplitude),
+            *motion_faults(),
         ]
     )
 
@@ -57,28 +59,29 @@ def runs_of(task: tuple[Fault, int]) -> list[tuple[Figures, Figures]]:
     """Run one fault with one seed; return, by filter, the figures with and without gates."""
     fault, seed = task
     recording = recording_of(fault, seed)
+    messages = messages_with_heading(recording)
 
     def figures(k: int, has_gates: bool) -> Figures:
-        return figures_of(fault, run_one(fault, recording, fault.filters[k], has_gates))
+        return figures_of(fault, run_one(fault, recording, fault.filters[k], has_gates, messages))
 
     return [(figures(k, True), figures(k, False)) for k in range(len(fault.filters))]
 
 
 def rows_of(faults: Sequence[Fault], seeds: int, jobs: int) -> Iterator[Row]:
     """Run faults on a pool of processes; yield a row for each fault and filter, in their order."""
-    tasks = [(fault, seed) for fault in faults for seed in range(seeds)]
+    tasks = [(fault, seed) for fault in faults for seed in range(max(seeds, fault.seeds))]
     with ProcessPoolExecutor(jobs) as pool:
-        found = track(pool.map(runs_of, tasks), "runs", len(tasks))
+        found = iter(track(pool.map(runs_of, tasks), "runs", len(tasks)))
         for fault in faults:
-            runs = [next(found) for _ in range(seeds)]
+            runs = [next(found) for _ in range(max(seeds, fault.seeds))]
             for k, given in enumerate(fault.filters):
                 yield Row(fault, given, [run[k][0] for run in runs], [run[k][1] for run in runs])
 
 
 def quick(fault: Fault) -> Fault:
-    """The same fault with two of the filters at most."""
+    """The same fault with two of the filters at most, and few seeds."""
     filters = tuple(given for given in fault.filters if given in QUICK_FILTERS)
-    return replace(fault, filters=filters or fault.filters[:1])
+    return replace(fault, filters=filters or fault.filters[:1], seeds=0)
 
 
 def main() -> int:

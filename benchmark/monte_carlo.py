@@ -9,7 +9,7 @@ Navigation, section 5.4).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -83,13 +83,23 @@ class Ensemble:
         return {name: nees(self.error, self.covariance, block) for name, block in BLOCKS.items()}
 
 
-def feed(recording: Recording, navigator: Navigator, stops: NDArray[np.int64]) -> Iterable[tuple[int, np.ndarray]]:
+Message = tuple[int, str, int, Array]
+"""Arrival (ns), table, stamp (ns) and row of a message."""
+
+
+def feed(
+    recording: Recording,
+    navigator: Navigator,
+    stops: NDArray[np.int64],
+    messages: Sequence[Message] | None = None,
+) -> Iterable[tuple[int, np.ndarray]]:
     """Run a recording through a navigator; yield (i, state) right after each of its IMU samples ``stops`` (indices).
 
     The state at a stop has seen what had arrived by then. In between, messages are handed over in bulk: the order
-    makes no difference to the state (principle of the timeline) but to the time it takes.
+    makes no difference to the state (principle of the timeline) but to the time it takes. ``messages``: those of
+    `messages_of`, or others, in the order of arrival.
     """
-    waiting, given, sample = messages_of(recording), 0, 0
+    waiting, given, sample = messages_of(recording) if messages is None else messages, 0, 0
     for i in stops:
         now = recording.imu_arrival[i]
         while given < len(waiting) and waiting[given][0] <= now:
@@ -102,7 +112,7 @@ def feed(recording: Recording, navigator: Navigator, stops: NDArray[np.int64]) -
         yield int(i), navigator.state[0]
 
 
-def messages_of(recording: Recording) -> list[tuple[int, str, int, Array]]:
+def messages_of(recording: Recording) -> list[Message]:
     """Return (arrival, table, stamp, row) of all messages of GNSS, wheels and body velocity, as they come."""
     places = np.column_stack([recording.fix_latitude_deg, recording.fix_longitude_deg, recording.fix_altitude])
     fixes = rows_from(places, recording.fix_covariance, recording.fix_covariance_type, recording.fix_status)

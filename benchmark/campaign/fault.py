@@ -82,6 +82,10 @@ class Fault:
     filters: tuple[Filter, ...] = ALL_FILTERS
     vehicles: tuple[str, ...] = ()
     """Scenarios on which the fault is tried, too."""
+    seeds: int = 0
+    """Runs, at least; 0 takes as many as of the others."""
+    given_heading_std_deg: float = 0.0
+    """The filter is given the heading at the start, off by a random angle of this size, and the size; 0: it is not."""
     is_steady: bool = False
     """Nothing tells the heading: its error must stay within what is claimed, on the mean over the runs."""
     is_slow: bool = False

@@ -38,6 +38,9 @@ KNOWN_WITHIN = 60.0
 CONSISTENT = (0.7, 1.5)
 """Bounds of the mean of (error/sigma)^2 of the heading where nothing tells it."""
 
+NEVER_AT_REST = ("boat", "long_flight")
+"""Scenarios in which hardly ever a moment is one of rest."""
+
 GATE_SHARE = 0.001
 """Share of good measurements that a gate refuses (``gnss.gate_probability``)."""
 
@@ -125,7 +128,7 @@ class Row:
     def missed(self) -> dict[int, list[str]]:
         """Return, by number of the bar, what misses it; a bar that the row is held against and meets is empty."""
         fault, found = self.fault, {1: self._lost(), 2: self._lies()}
-        if fault.kind == Kind.MOTION or fault.kind == Kind.CLEAN:
+        if fault.kind == Kind.MOTION or (fault.kind == Kind.CLEAN and fault.scenario in NEVER_AT_REST):
             found[5] = self._rest()
         if fault.is_slow:
             found[6] = self._known()
@@ -141,12 +144,12 @@ class Row:
         found = []
         lost = mean([run.lost for run in self.runs])
         if lost > 0.0:
-            found.append(f"lost {100.0 * lost:.2g} %")
+            found.append(f"lost {100.0 * lost:.1f} %")
         worst, bar = max(run.worst for run in self.runs), LARGEST_ERROR[self.given.has_velocity]
         if self.fault.kind == Kind.IMU and worst > bar:
-            found.append(f"worst {worst:.0f} m")
+            found.append(f"worst {metres(worst)} m")
         if self.ungated and self.median_worst(self.runs) > 1.1 * self.median_worst(self.ungated) + ROUNDING:
-            found.append(f"without gates {self.median_worst(self.ungated):.2f} m")
+            found.append(f"without gates {metres(self.median_worst(self.ungated))} m")
         thrown = sum(run.thrown_away for run in self.runs)
         if thrown:
             found.append(f"{thrown} headings thrown away")
@@ -159,7 +162,7 @@ class Row:
             ("heading", [run.heading_lies for run in self.runs]),
         ):
             if mean(shares) > LIES:
-                found.append(f"{what} lies {100.0 * mean(shares):.2g} %")
+                found.append(f"{what} lies {100.0 * mean(shares):.1f} %")
         if self.fault.is_steady:
             square = self.heading_square()
             if not (math.isnan(square) or CONSISTENT[0] <= square <= CONSISTENT[1]):
@@ -228,8 +231,8 @@ class Row:
         return [
             self.fault.name,
             str(self.given),
-            f"{self.median_worst(runs):.1f} / {max(run.worst for run in runs):.0f}",
-            f"{self.median_worst(self.ungated):.1f} / {max(run.worst for run in self.ungated):.0f}",
+            f"{metres(self.median_worst(runs))} / {metres(max(run.worst for run in runs))}",
+            f"{metres(self.median_worst(self.ungated))} / {metres(max(run.worst for run in self.ungated))}",
             percent([run.lost for run in runs]),
             f"{percent([run.position_lies for run in runs])} / {percent([run.heading_lies for run in runs])}",
             f"{self.heading_square():.2f}",
@@ -268,6 +271,11 @@ HEADINGS = (
     "bars missed",
     "said most",
 )
+
+
+def metres(error: float) -> str:
+    """Return an error in as many digits as mean something."""
+    return f"{error:.1f}" if error < 99.95 else f"{error:.0f}" if error < 1e5 else f"{error:.0e}"
 
 
 def mean(values: Sequence[float]) -> float:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +18,9 @@ from eskf_ros.filter.state.enums import SENSOR_STREAMS, Stream, Verdict
 from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.imu import ImuMount
 from eskf_ros.simulate.scenario import Recording, simulate
-from monte_carlo import NO_SIDE_SLIP, feed
+from eskf_ros.simulate.scenarios import scenario
+from eskf_ros.tables.feeding import rows_from
+from monte_carlo import NO_SIDE_SLIP, Message, feed, messages_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -70,9 +72,19 @@ def without_gates(navigator: Navigator) -> None:
     navigator._settings["gate"][:] = 1e300
 
 
+CARS = ("drive", "hour_drive", "tunnel_drive", "stand", "straight", "creep", "train")
+"""Scenarios, or their families, in which what moves points where it goes: the filter is told so."""
+
+
 def parameters_of(fault: Fault, recording: Recording, is_told: bool) -> dict[str, Any]:
     """Parameters of the recording, changed by the fault; without the noise of the IMU where it is not told."""
-    parameters = {**recording.parameters(), **NO_SIDE_SLIP}
+    parameters = recording.parameters()
+    if fault.scenario.partition(":")[0] in CARS:
+        parameters.update(NO_SIDE_SLIP)
+    if std := fault.given_heading_std_deg:
+        off = std * np.random.default_rng(10_000 + recording.seed).standard_normal()
+        parameters["alignment.initial_heading_deg"] = scenario(fault.scenario).heading_deg + off
+        parameters["alignment.initial_heading_std_deg"] = std
     if not is_told:
         parameters = {name: value for name, value in parameters.items() if name.removeprefix("imu.") not in IMU_NOISE}
     for name, value in fault.parameters.items():
@@ -89,18 +101,41 @@ def recording_of(fault: Fault, seed: int) -> Recording:
     return simulate(fault.scenario, seed, **options)
 
 
-def run_one(fault: Fault, recording: Recording, given: Filter, has_gates: bool = True) -> Trace:
-    """Run a filter over the recording of a fault."""
+def messages_with_heading(recording: Recording) -> list[Message]:
+    """Return all messages of a recording in the order of arrival, those of a dual antenna among them."""
+    found, antenna = messages_of(recording), recording.dual_antenna
+    if antenna is not None:
+        values = np.column_stack([antenna.yaw, np.zeros((len(antenna.yaw), 2))])
+        variances = np.diag([math.radians(antenna.sensor.yaw_std_deg) ** 2, -1.0, -1.0])
+        rows = rows_from(values, variances)
+        found += [
+            (int(arrival), "heading", int(stamp), row)
+            for arrival, stamp, row in zip(antenna.arrival, antenna.stamp, rows)
+        ]
+    return sorted(found, key=lambda message: message[0])
+
+
+def run_one(
+    fault: Fault,
+    recording: Recording,
+    given: Filter,
+    has_gates: bool = True,
+    messages: Sequence[Message] | None = None,
+) -> Trace:
+    """Run a filter over the recording of a fault; ``messages``: those of `messages_with_heading`, where known."""
+    if messages is None:
+        messages = messages_with_heading(recording)
     if not given.has_velocity:
-        recording = dataclasses.replace(recording, velocity_stamp=recording.velocity_stamp[:0])
+        messages = [message for message in messages if message[1] != "gnss_velocity"]
     navigator = Navigator(from_mapping(parameters_of(fault, recording, given.is_told)))
     if not has_gates:
         without_gates(navigator)
     start = int(recording.truth_stamp[0])
     taken = (recording.imu_taken - start) * 1e-9
     stops = np.unique(np.searchsorted(taken, np.arange(1.0, taken[-1])))
-    states, records, said = [], [], {}
-    for k, (_, state) in enumerate(feed(recording, navigator, stops)):
+    states, records = [], []
+    said: dict[str, float] = {}
+    for k, (_, state) in enumerate(feed(recording, navigator, stops, messages)):
         states.append(state.copy())
         if k % ASKED_EVERY == 0:
             records.append(navigator.take_records())

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 
 from eskf_ros.simulate.jets import Taylor, sin_cos
 from eskf_ros.simulate.path import PathState, PathTrajectory, Pose, waves
+from eskf_ros.simulate.profile import Instruction
 
 CURRENT = (0.35, -0.25)
-"""Velocity of the water, east and north, m/s."""
+"""Velocity of the water, east and north, m/s, unless it is told."""
 
 _HEAVE = ((0.25, 0.16, 0.0), (0.12, 0.27, 1.3))
 _SURGE = ((0.15, 0.16, 1.6), (0.06, 0.27, 2.9))
@@ -23,10 +24,20 @@ _YAW = ((math.radians(2.0), 0.11, 0.0),)
 class BoatTrajectory(PathTrajectory):
     """A boat that heads through the water as it is told and drifts with the current; it never is at rest."""
 
+    def __init__(
+        self,
+        instructions: Sequence[Instruction],
+        heading_deg: float = 0.0,
+        current: tuple[float, float] = CURRENT,
+    ) -> None:
+        """Start with ``heading_deg``, counter-clockwise from east; ``current``: of the water, east and north, m/s."""
+        self._current = current
+        super().__init__(instructions, heading_deg)
+
     def velocity(self, state: PathState) -> Sequence[Taylor]:
         """Return the velocity over ground without the waves."""
         sine, cosine = sin_cos(state.yaw)
-        return state.speed * cosine + CURRENT[0], state.speed * sine + CURRENT[1], 0.0 * state.speed
+        return state.speed * cosine + self._current[0], state.speed * sine + self._current[1], 0.0 * state.speed
 
     def pose(self, state: PathState, way: Sequence[Taylor]) -> Pose:
         """Return the pose in the waves."""

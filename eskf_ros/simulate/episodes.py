@@ -48,7 +48,7 @@ class ClockSet(Episode):
 
     def shifts(self, elapsed: NDArray[np.float64]) -> NDArray[np.int64]:
         """Return what is added (ns) to stamps of the times ``elapsed`` (s)."""
-        return np.where(self.covers(elapsed), round(self.step * 1e9), 0)
+        return np.where(self.covers(elapsed), round(self.step * 1e9), 0).astype(np.int64)
 
 
 @dataclass(frozen=True)

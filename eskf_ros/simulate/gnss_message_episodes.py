@@ -30,7 +30,12 @@ class GnssMessageEpisode(Episode):
 
     def covers_stamps(self, stamps: Stamps) -> NDArray[np.bool_]:
         """Return which of ``stamps`` (ns) lie in the episode."""
-        return self.covers((stamps - START_STAMP) * 1e-9)
+        return self.covers(_elapsed(stamps))
+
+
+def _elapsed(stamps: Stamps) -> NDArray[np.float64]:
+    """Return seconds from time zero."""
+    return np.asarray((stamps - START_STAMP) * 1e-9, np.float64)
 
 
 def changed_messages(said: GnssMeasurements, episode: Episode, stream: np.random.Generator) -> GnssMeasurements:
@@ -40,8 +45,8 @@ def changed_messages(said: GnssMeasurements, episode: Episode, stream: np.random
     if isinstance(episode, ClockSet):
         return dataclasses.replace(
             said,
-            fix_stamp=said.fix_stamp + episode.shifts((said.fix_stamp - START_STAMP) * 1e-9),
-            velocity_stamp=said.velocity_stamp + episode.shifts((said.velocity_stamp - START_STAMP) * 1e-9),
+            fix_stamp=said.fix_stamp + episode.shifts(_elapsed(said.fix_stamp)),
+            velocity_stamp=said.velocity_stamp + episode.shifts(_elapsed(said.velocity_stamp)),
         )
     return said
 

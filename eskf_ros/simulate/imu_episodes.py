@@ -37,6 +37,11 @@ class ImuSamples:
     angular_rate: Array
     kept: NDArray[np.bool_]
 
+    @classmethod
+    def of(cls, elapsed: Array, stamp: Stamps, specific_force: Array, angular_rate: Array) -> ImuSamples:
+        """Return samples that are all sent; the readings are changed in place, the stamps are not."""
+        return cls(elapsed, stamp.copy(), specific_force, angular_rate, np.ones(len(stamp), bool))
+
 
 @dataclass(frozen=True)
 class ImuEpisode(Episode):
@@ -45,6 +50,10 @@ class ImuEpisode(Episode):
     def change(self, samples: ImuSamples, stream: np.random.Generator) -> None:
         """Change ``samples``; ``stream`` is for what is random."""
         raise NotImplementedError
+
+
+IMU_CHANGES = (ImuEpisode, ClockSet)
+"""The kinds of episodes that change samples."""
 
 
 def change_samples(samples: ImuSamples, episode: Episode, stream: np.random.Generator) -> None:

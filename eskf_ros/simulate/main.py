@@ -19,6 +19,7 @@ from eskf_ros.simulate.imu import GRADES
 from eskf_ros.simulate.messages import Topic, topics_of
 from eskf_ros.simulate.recording import AIDS, EPISODES
 from eskf_ros.simulate.scenario import SCENARIOS, Options, Recording, simulate
+from eskf_ros.simulate.scenario_families import FAMILIES
 
 _BLOCK_NANOSECONDS = 60_000_000_000
 
@@ -29,10 +30,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments.list:
         print(_list())
         return 0
-    out: Path = arguments.out or Path(f"{arguments.scenario}.mcap")
+    out: Path = arguments.out or Path(f"{str(arguments.scenario).replace(':', '_')}.mcap")
     try:
         if arguments.scenario is None:
-            raise ValueError(f"name a scenario: {', '.join(SCENARIOS)}")
+            raise ValueError(f"name a scenario: {', '.join(SCENARIOS)}, or one with a number, such as creep:0.4")
         if not out.parent.is_dir():
             raise ValueError(f"{out}: there is no folder {out.parent}")
         recording = simulate(arguments.scenario, arguments.seed, **_options(arguments))
@@ -61,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
         description="Write a simulated motion as a rosbag2 recording (mcap) with IMU, GNSS, truth and other sensors. "
         "The same scenario, seed and options give the same recording.",
     )
-    parser.add_argument("scenario", nargs="?", metavar="SCENARIO", help=f"one of {', '.join(SCENARIOS)}")
+    parser.add_argument("scenario", nargs="?", metavar="SCENARIO", help="what moves, and how; --list describes them")
     parser.add_argument("--list", action="store_true", help="describe scenarios, sensors and episodes and stop")
     parser.add_argument("--out", type=Path, metavar="FILE.mcap", help="the file to write (default: SCENARIO.mcap here)")
     parser.add_argument("--seed", type=_seed, default=0, metavar="N", help="seed of all random errors (default 0)")
@@ -108,10 +109,12 @@ def _options(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _list() -> str:
-    width = max(map(len, SCENARIOS))
+    width = max(map(len, (*SCENARIOS, *FAMILIES))) + len(":deg/s")
     lines = [
         "Scenarios:",
         *(f"  {name:{width}}  {found.description}" for name, found in SCENARIOS.items()),
+        "Scenarios with a number:",
+        *(f"  {f'{name}:{family.unit}':{width}}  {family.description}" for name, family in FAMILIES.items()),
         "Sensors, with --sensor:",
         *(f"  {option_text.spelled(name, kind)}" for name, kind in AIDS.items()),
         "Episodes, with --episode; START and LENGTH in seconds:",

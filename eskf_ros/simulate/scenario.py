@@ -24,7 +24,7 @@ from eskf_ros.simulate.imu import (
     ideal_samples,
     vibration,
 )
-from eskf_ros.simulate.imu_episodes import ImuSamples, change_samples
+from eskf_ros.simulate.imu_episodes import IMU_CHANGES, ImuSamples, change_samples
 from eskf_ros.simulate.recording import AIDS, Options, Recording
 from eskf_ros.simulate.sampling import (
     START_STAMP,
@@ -80,16 +80,14 @@ def simulate(name: str, seed: int = 0, **options: Any) -> Recording:
         streams = generators(seed_of(seed, RandomStream.VIBRATION), 2)
         specific_force += vibration(speed, chosen.vibration[0], streams[0])
         angular_rate += vibration(speed, chosen.vibration[1], streams[1])
-    seeds = seed_of(seed, RandomStream.IMU_EPISODES)
-    samples = ImuSamples(
-        section.elapsed(ideal.imu_stamp),
-        ideal.imu_stamp.copy(),
-        specific_force,
-        angular_rate,
-        np.ones(len(ideal.imu_stamp), bool),
-    )
-    for episode, stream in zip(episodes, generators(seeds, len(episodes)), strict=True):
-        change_samples(samples, episode, stream)
+    imu_stamp = ideal.imu_stamp
+    kept: slice | NDArray[np.bool_] = slice(None)
+    if any(isinstance(episode, IMU_CHANGES) for episode in episodes):
+        samples = ImuSamples.of(section.elapsed(imu_stamp), imu_stamp, specific_force, angular_rate)
+        streams = generators(seed_of(seed, RandomStream.IMU_EPISODES), len(episodes))
+        for episode, stream in zip(episodes, streams, strict=True):
+            change_samples(samples, episode, stream)
+        imu_stamp, kept = samples.stamp[samples.kept], samples.kept
     imu_delay, *gnss_delays = generators(seed_of(seed, RandomStream.ARRIVAL), 3)
     gnss_streams = GnssStreams(*generators(seed_of(seed, RandomStream.GNSS), 3), *gnss_delays)
     aids = {
@@ -108,13 +106,13 @@ def simulate(name: str, seed: int = 0, **options: Any) -> Recording:
         options=chosen,
         datum=DATUM,
         outages=tuple((gap.start, gap.start + gap.length) for gap in outages_of(episodes, (1,))),
-        imu_stamp=samples.stamp[samples.kept],
-        imu_taken=ideal.imu_stamp[samples.kept],
-        imu_arrival=arrivals(ideal.imu_stamp, IMU_LATENCY, imu_delay)[samples.kept],
-        specific_force=specific_force[samples.kept],
-        angular_rate=angular_rate[samples.kept],
-        accel_bias=accel_bias[samples.kept],
-        gyro_bias=gyro_bias[samples.kept],
+        imu_stamp=imu_stamp,
+        imu_taken=ideal.imu_stamp[kept],
+        imu_arrival=arrivals(ideal.imu_stamp, IMU_LATENCY, imu_delay)[kept],
+        specific_force=specific_force[kept],
+        angular_rate=angular_rate[kept],
+        accel_bias=accel_bias[kept],
+        gyro_bias=gyro_bias[kept],
         truth_stamp=ideal.truth_stamp,
         truth_position_map=ideal.truth_position_map,
         truth_velocity_map=ideal.truth_velocity_map,

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 from eskf_ros.simulate.aeroplane import AeroplaneTrajectory
 from eskf_ros.simulate.boat import BoatTrajectory
@@ -22,7 +22,8 @@ from eskf_ros.simulate.profile import (
     Turn,
     TurnInPlace,
 )
-from eskf_ros.simulate.trajectory import SIDE_SLIP_PER_ACCELERATION, DriveTrajectory
+from eskf_ros.simulate.scenario_families import FAMILIES, driven
+from eskf_ros.simulate.trajectory import SIDE_SLIP_PER_ACCELERATION
 from eskf_ros.simulate.walk import WalkTrajectory
 
 
@@ -38,10 +39,6 @@ class Scenario:
     move: Callable[[float], Trajectory]
     heading_deg: float
     outages: tuple[tuple[float, float], ...] = ()
-
-
-def _drive(instructions: Sequence[Instruction], **options: Any) -> Callable[[float], Trajectory]:
-    return lambda heading_deg: DriveTrajectory(instructions, heading_deg, **options)
 
 
 _CITY_LAP: tuple[Instruction, ...] = (
@@ -202,12 +199,12 @@ _CRUISE: tuple[Instruction, ...] = (
 SCENARIOS: dict[str, Scenario] = {
     "drive": Scenario(
         "five minutes in a city: two laps around blocks, with turns and stops",
-        _drive((Hold(20.0), *_CITY_LAP, *_CITY_LAP, Hold(5.0))),
+        driven((Hold(20.0), *_CITY_LAP, *_CITY_LAP, Hold(5.0))),
         heading_deg=35.0,
     ),
     "tunnel_drive": Scenario(
         "stand still 20 s, drive with turns and stops, a tunnel of 45 s at speed, and on",
-        _drive(
+        driven(
             (
                 Hold(20.0),
                 SpeedTo(8.0),
@@ -249,24 +246,24 @@ SCENARIOS: dict[str, Scenario] = {
     ),
     "hour_drive": Scenario(
         "one hour of city laps, for measuring speed",
-        _drive((Hold(20.0), *(_CITY_LAP * 27), Hold(47.5))),
+        driven((Hold(20.0), *(_CITY_LAP * 27), Hold(47.5))),
         heading_deg=35.0,
     ),
     "long_tunnel": Scenario(
         "a city lap, then five minutes in a tunnel with bends, slow traffic and stops, on tyres that slip sideways",
-        _drive((Hold(20.0), *_CITY_LAP, *_TUNNEL), side_slip=SIDE_SLIP_PER_ACCELERATION),
+        driven((Hold(20.0), *_CITY_LAP, *_TUNNEL), side_slip=SIDE_SLIP_PER_ACCELERATION),
         heading_deg=-130.0,
         outages=((TUNNEL_START, TUNNEL_START + 300.0),),
     ),
     "garage": Scenario(
         "a city lap, then ten minutes parked in a garage",
-        _drive((Hold(20.0), *_CITY_LAP, Hold(600.0))),
+        driven((Hold(20.0), *_CITY_LAP, Hold(600.0))),
         heading_deg=50.0,
         outages=((PARKED, PARKED + 600.0),),
     ),
     "reverse_start": Scenario(
         "a car backs out of its place before it drives",
-        _drive(
+        driven(
             (
                 Hold(20.0),
                 SpeedTo(-2.0, 1.0),
@@ -281,15 +278,15 @@ SCENARIOS: dict[str, Scenario] = {
         ),
         heading_deg=110.0,
     ),
-    "parked": Scenario("a car stands for ten minutes", _drive((Hold(600.0),)), heading_deg=-75.0),
+    "parked": Scenario("a car stands for ten minutes", driven((Hold(600.0),)), heading_deg=-75.0),
     "motorway": Scenario(
         "five minutes straight on at 33 m/s: nothing to tell heading and biases apart",
-        _drive((Hold(300.0),), speed=33.0, hills=()),
+        driven((Hold(300.0),), speed=33.0, hills=()),
         heading_deg=62.0,
     ),
     "field_robot": Scenario(
         "a slow robot on uneven ground: rows, with turns in place between them",
-        _drive((Hold(15.0), *(_ROWS * 4), Hold(10.0)), hills=((0.05, 9.0), (0.025, 2.6))),
+        driven((Hold(15.0), *(_ROWS * 4), Hold(10.0)), hills=((0.05, 9.0), (0.025, 2.6))),
         heading_deg=0.0,
     ),
     "walk": Scenario(
@@ -321,10 +318,21 @@ SCENARIOS: dict[str, Scenario] = {
 
 
 def scenario(name: str) -> Scenario:
-    """Return the scenario ``name``; ValueError names those there are."""
-    if name not in SCENARIOS:
-        raise ValueError(f"unknown scenario '{name}'; there are {', '.join(SCENARIOS)}")
-    return SCENARIOS[name]
+    """Return the scenario ``name``, FAMILY:NUMBER for one of a family; ValueError names those there are."""
+    if name in SCENARIOS:
+        return SCENARIOS[name]
+    kind, _, number = name.partition(":")
+    if kind not in FAMILIES:
+        families = (f"{family}:NUMBER" for family in FAMILIES)
+        raise ValueError(f"unknown scenario '{name}'; there are {', '.join((*SCENARIOS, *families))}")
+    family = FAMILIES[kind]
+    try:
+        value = float(number)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise ValueError(f"scenario '{name}' wants a positive number of {family.unit}, as in {kind}:2")
+    return Scenario(f"{family.description}; {value:g} {family.unit}", family.move(value), family.heading_deg)
 
 
 @lru_cache(maxsize=4)
