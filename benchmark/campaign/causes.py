@@ -37,6 +37,7 @@ CAUSES = {
     "multipath": r"multipath",
     "spoofing": r"spoof",
     "given heading": r"initial_heading_deg.*(wrong|contradict|off)|heading (that was )?given.*(wrong|contradict|off)",
+    "course": r"use_course|course over ground|side slip|crab",
     "low rate": r"imu\.gap",
     "nanoseconds": r"nanosec",
     "altitude missing": r"without an altitude|altitude.*(NaN|not a number|missing)",

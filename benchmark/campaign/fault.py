@@ -86,6 +86,8 @@ class Fault:
     """Runs, at least; 0 takes as many as of the others."""
     given_heading_std_deg: float = 0.0
     """The filter is given the heading at the start, off by a random angle of this size, and the size; 0: it is not."""
+    is_version: bool = False
+    """It is a fault of the city drives, on another vehicle."""
     is_steady: bool = False
     """Nothing tells the heading: its error must stay within what is claimed, on the mean over the runs."""
     is_slow: bool = False
@@ -95,7 +97,14 @@ class Fault:
 
     def on(self, vehicle: str) -> Fault:
         """The same fault of another vehicle, with the usual filter alone."""
-        return replace(self, name=f"{self.name}: {vehicle}", scenario=vehicle, filters=(DEFAULT_VELOCITY,), vehicles=())
+        return replace(
+            self,
+            name=f"{self.name}: {vehicle}",
+            scenario=vehicle,
+            filters=(DEFAULT_VELOCITY,),
+            vehicles=(),
+            is_version=True,
+        )
 
 
 VEHICLES = ("field_robot", "boat", "long_flight")

@@ -90,7 +90,7 @@ def figures_of(fault: Fault, trace: Trace) -> Figures:
     named = [when for sentence, when in trace.said.items() if is_named(sentence, fault.names)]
     wrong = tuple(text for text in trace.said if is_wrong(text, fault.names, fault.also))
     return Figures(
-        worst=float(trace.error[t >= fault.begin].max()),
+        worst=float(trace.error[t >= min(fault.begin, t[-1])].max()),
         lost=share(trace.error > np.maximum(FAR, SIGMAS * trace.sigma), counted),
         position_lies=share(trace.error > SIGMAS * trace.sigma, judged),
         heading_lies=share(ratio > SIGMAS, judged),

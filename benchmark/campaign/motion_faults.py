@@ -51,10 +51,16 @@ def motion_faults() -> list[Fault]:
             also=("given heading",),
         ),
         *(
-            _honestly_given(_motion(f"creep of {speed:g} m/s", f"creep:{speed:g}", 260.0, options=options), 5.0)
-            for speed in (0.1, 0.4, 1.0)
-            for options in ({}, {"gnss_rate": 1.0})
-            if not options or speed == 1.0
+            _honestly_given(
+                _motion(
+                    f"creep of {speed:g} m/s, fixes at {rate:g} Hz",
+                    f"creep:{speed:g}",
+                    260.0,
+                    options={"gnss_rate": rate},
+                ),
+                5.0,
+            )
+            for speed, rate in ((0.1, 5.0), (0.4, 5.0), (1.0, 5.0), (1.0, 1.0))
         ),
         *(
             _motion(
@@ -75,6 +81,13 @@ def motion_faults() -> list[Fault]:
         ),
         _motion("boat in waves", "boat", 350.0, is_steady=True, seeds=MANY_SEEDS),
         _motion("boat that crabs 40 deg", "crab:40", 260.0),
+        _motion(
+            "boat that crabs 40 deg, told to use its course",
+            "crab:40",
+            260.0,
+            parameters={"alignment.use_course": True},
+            also=("course",),
+        ),
         _motion("skid-steer", "skid_steer:0.8", 240.0, is_slow=True),
         _motion("mower rows, RTK", "field_robot", 286.0, episodes=(RTK,), is_slow=True),
         _motion(

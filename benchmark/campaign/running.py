@@ -40,12 +40,13 @@ MOVES, TURNS = 0.05, math.radians(0.1)
 
 @dataclass(frozen=True)
 class Trace:
-    """What a run gave at n times, ``seconds`` (n,) from the start.
+    """What a run gave at n times, ``seconds`` (n,) from the start, since the position was known for the first time.
 
     ``error``, ``sigma``: horizontal, m. ``heading_error``, ``heading_sigma``: rad; where the heading is not
     ``is_known`` they say nothing. ``speed``, ``turn``: of the truth, m/s and rad/s. ``said``: sentences, with the time
-    (s) at which each was first seen, numbers left out. ``refused``: share of the measurements that no gate let in.
-    ``rest`` (m,): stamps at which rest was taken for granted (s), ``rest_speed`` and ``rest_turn`` the truth there.
+    (s) at which each was first seen, numbers left out; ``final``: those at the end, as they are. ``offered``,
+    ``refused``: measurements, and those of them that were not fused. ``rest_speed`` (m,), ``rest_turn`` (k,): the truth
+    at the stamps at which rest and a standing heading were taken for granted; ``rest`` (m,): the former, s.
     """
 
     seconds: Array
@@ -60,6 +61,7 @@ class Trace:
     resets: int
     thrown_away: int
     said: dict[str, float]
+    final: tuple[str, ...]
     offered: int
     refused: int
     rest: Array
@@ -133,10 +135,12 @@ def run_one(
     start = int(recording.truth_stamp[0])
     taken = (recording.imu_taken - start) * 1e-9
     stops = np.unique(np.searchsorted(taken, np.arange(1.0, taken[-1])))
-    states, records = [], []
+    states: list[np.ndarray] = []
+    records = []
     said: dict[str, float] = {}
     for k, (_, state) in enumerate(feed(recording, navigator, stops, messages)):
-        states.append(state.copy())
+        if states or state["position_known"]:
+            states.append(state.copy())
         if k % ASKED_EVERY == 0:
             records.append(navigator.take_records())
             for sentence in sentences(navigator):
@@ -144,6 +148,8 @@ def run_one(
     records.append(navigator.finish())
     for sentence in sentences(navigator):
         said.setdefault(sentence, float(taken[-1]))
+    if not states:  # The filter never started: it claims nothing, and has nothing but its word.
+        states.append(state.copy())
     return _trace(recording, navigator, stops, np.array(states), np.concatenate(records, dtype=RECORD), said)
 
 
@@ -161,6 +167,7 @@ def _trace(
     records: np.ndarray,
     said: dict[str, float],
 ) -> Trace:
+    stops = stops[len(stops) - len(states) :]
     truth = np.searchsorted(recording.truth_stamp, recording.imu_taken[stops])
     truth = np.minimum(truth, len(recording.truth_stamp) - 1)
     mount = ImuMount(recording.options.imu_position, recording.options.imu_rpy_deg)
@@ -198,6 +205,7 @@ def _trace(
         resets=navigator.position_resets,
         thrown_away=int(np.count_nonzero(was_known & ~is_known[1:])),
         said=said,
+        final=tuple(navigator.complaints),
         offered=len(aids),
         refused=int(np.count_nonzero(~np.isin(aids["verdict"], (Verdict.FUSED, Verdict.WEIGHED_DOWN)))),
         rest=(rest - recording.truth_stamp[0]) * 1e-9,
