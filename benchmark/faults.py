@@ -1,6 +1,7 @@
 """Faults that the model does not know, one by one: is the filter lost, does it lie, and what does it say?
 
     python benchmark/faults.py [--seeds 20] [--only WORD] [--amplitude 1] [--jobs 2] [--quick] [--out docs/trust.md]
+        [--generator independent]
 
 Every fault (`campaign/`) is an episode of the simulation (`eskf_simulate --episode`) or a wrong parameter, on city
 drives of 286 s, and faults of sensors with the default noise on a field robot, a boat and a multirotor, too. "told":
@@ -31,12 +32,17 @@ from rich.progress import track
 from campaign.document import replace_section
 from campaign.fault import DEFAULT_POSITION, TOLD_VELOCITY, VEHICLES, Fault, Kind, with_vehicles
 from campaign.imu_faults import ROUGH, imu_faults
+from campaign.independent import FOLDER, has_drive
 from campaign.judge import HEADINGS, Figures, Row, figures_of, summary
 from campaign.motion_faults import motion_faults
 from campaign.receiver_faults import receiver_faults
 from campaign.running import messages_with_heading, recording_of, run_one
 from campaign.settings_faults import settings_faults
 from markdown_table import table
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "test"))
+
+from support.data import find_data_folder
 
 QUICK_FILTERS = (TOLD_VELOCITY, DEFAULT_POSITION)
 QUICK_SEEDS = 3
@@ -56,10 +62,10 @@ def all_faults(amplitude: float = 1.0) -> list[Fault]:
     )
 
 
-def runs_of(task: tuple[Fault, int]) -> list[tuple[Figures, Figures]]:
+def runs_of(task: tuple[Fault, int, Path | None]) -> list[tuple[Figures, Figures]]:
     """Run one fault with one seed; return, by filter, the figures with and without gates."""
-    fault, seed = task
-    recording = recording_of(fault, seed)
+    fault, seed, drives = task
+    recording = recording_of(fault, seed, drives)
     messages = messages_with_heading(recording)
 
     def figures(k: int, has_gates: bool) -> Figures:
@@ -68,9 +74,9 @@ def runs_of(task: tuple[Fault, int]) -> list[tuple[Figures, Figures]]:
     return [(figures(k, True), figures(k, False)) for k in range(len(fault.filters))]
 
 
-def rows_of(faults: Sequence[Fault], seeds: int, jobs: int) -> Iterator[Row]:
+def rows_of(faults: Sequence[Fault], seeds: int, jobs: int, drives: Path | None = None) -> Iterator[Row]:
     """Run faults on a pool of processes; yield a row for each fault and filter, in their order."""
-    tasks = [(fault, seed) for fault in faults for seed in range(max(seeds, fault.seeds))]
+    tasks = [(fault, seed, drives) for fault in faults for seed in range(max(seeds, fault.seeds))]
     with ProcessPoolExecutor(jobs) as pool:
         found = iter(track(pool.map(runs_of, tasks), "runs", len(tasks)))
         for fault in faults:
@@ -93,6 +99,12 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--only", default="", metavar="WORD", help="faults with this word in their name or kind")
     parser.add_argument("--amplitude", type=float, default=1.0, metavar="FACTOR", help="size of the faults (default 1)")
+    parser.add_argument(
+        "--generator",
+        choices=("own", "independent"),
+        default="own",
+        help="independent: the faults on drives of another generator, where their files are",
+    )
     parser.add_argument("--jobs", type=int, default=2, help="processes (default 2)")
     parser.add_argument("--quick", action="store_true", help=f"{QUICK_SEEDS} seeds, two filters, city drives only")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the table to this document")
@@ -101,8 +113,16 @@ def main() -> int:
     seeds = options.seeds
     if options.quick:
         seeds, chosen = QUICK_SEEDS, [quick(fault) for fault in chosen if not fault.is_version]
+    drives = None
+    if options.generator == "independent":
+        try:
+            drives = find_data_folder(FOLDER)
+        except FileNotFoundError as problem:
+            print(f"skipped: {problem}")
+            return 0
+        chosen = [fault for fault in chosen if has_drive(fault)]
     try:
-        rows = list(rows_of(chosen, seeds, options.jobs))
+        rows = list(rows_of(chosen, seeds, options.jobs, drives))
     except KeyboardInterrupt:
         return 130
     text = table(HEADINGS, [row.cells() for row in rows])

@@ -85,7 +85,9 @@ class Fault:
     seeds: int = 0
     """Runs, at least; 0 takes as many as of the others."""
     given_heading_std_deg: float = 0.0
-    """The filter is given the heading at the start, off by a random angle of this size, and the size; 0: it is not."""
+    """Standard deviation of the heading at the start that the filter is given; 0: it is given none."""
+    given_heading_off_deg: float | None = None
+    """How far that heading is off; None: at random, as far as the standard deviation says."""
     is_version: bool = False
     """It is a fault of the city drives, on another vehicle."""
     is_steady: bool = False

@@ -1,13 +1,13 @@
 """Drives of a generator that is not ours, as recordings: so that a proof does not share our simulator's assumptions.
 
 A file holds one drive as numpy arrays (`nmayorov/pyins`): ``imu_t`` s, ``gyro`` rad/s, ``accel`` m/s2 (forward, left,
-up), ``fix_t``, ``fix_lla`` deg deg m and ``fix_velocity_enu`` of the antenna, their standard deviations, ``lever_arm`` m,
-and the truth of the IMU. Another seed is another part of a drive, or another drive.
+up), ``fix_t``, ``fix_lla`` deg deg m and ``fix_velocity_enu`` of the antenna, their standard deviations, ``lever_arm``
+m, and the truth of the IMU. Another seed is another part of a drive, or another drive.
 """
 
 from __future__ import annotations
 
-import math
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -22,12 +22,15 @@ from eskf_ros.simulate.episodes import Episode, received
 from eskf_ros.simulate.gnss import GnssMeasurements
 from eskf_ros.simulate.gnss_episodes import GnssEpisode, GnssReport
 from eskf_ros.simulate.gnss_message_episodes import changed_messages
-from eskf_ros.simulate.imu import vibration
+from eskf_ros.simulate.imu import GRADES, vibration
 from eskf_ros.simulate.imu_episodes import ImuSamples, change_samples
 from eskf_ros.simulate.recording import Options, Recording
 from eskf_ros.simulate.sampling import START_STAMP, Stamps, arrivals, generators, nanoseconds
 
 Array = NDArray[np.float64]
+
+FOLDER = "independent_drives"
+"""Of the real recordings and of these."""
 
 FILES = {"drive": ("car_2", "car_3"), "stand": ("parked",), "straight": ("motorway",)}
 """Files by the scenario, or its family, that they stand in for."""
@@ -36,6 +39,18 @@ PARTS_APART = 40.0
 """s between the beginnings of two parts of a drive."""
 
 NOISE = ("gyro_noise_density", "accel_noise_density", "gyro_bias_random_walk", "accel_bias_random_walk")
+
+
+@dataclass(frozen=True)
+class IndependentRecording(Recording):
+    """A recording that states the noise of its own IMU."""
+
+    noise: dict[str, float] = field(default_factory=dict)
+
+    def parameters(self) -> dict[str, Any]:
+        """Return the parameters that describe its sensors; the turn-on biases are those of the defaults."""
+        mounting = {name: value for name, value in super().parameters().items() if name not in GRADES["consumer"]}
+        return {**mounting, **self.noise}
 
 
 def has_drive(fault: Fault) -> bool:
@@ -53,7 +68,7 @@ def _geodetic_to_map(frame: MapFrame, lla: Array) -> Array:
     return np.array([frame.from_geodetic_deg(*place) for place in lla.tolist()])
 
 
-def recording_from(folder: Path, fault: Fault, seed: int) -> Recording:
+def recording_from(folder: Path, fault: Fault, seed: int) -> IndependentRecording:
     """Return the part of a drive that ``seed`` means, with the episodes of a fault."""
     names = FILES[fault.scenario.partition(":")[0]]
     drive = _drive(folder, names[seed % len(names)])
@@ -77,7 +92,7 @@ def recording_from(folder: Path, fault: Fault, seed: int) -> Recording:
         speed = np.interp(imu_stamp, truth_stamp, np.linalg.norm(velocity, axis=1))
         force += vibration(speed, fault.options["vibration"][0], streams[-1])
         rate += vibration(speed, fault.options["vibration"][1], streams[-2])
-    samples = ImuSamples.of((imu_stamp - START_STAMP) * 1e-9, imu_stamp, force, rate)
+    samples = ImuSamples.of(drive["imu_t"][imu] - begin, imu_stamp, force, rate)
     for episode, stream in zip(fault.episodes, streams):
         change_samples(samples, episode, stream)
     elapsed = drive["fix_t"][fix] - begin
@@ -89,7 +104,7 @@ def recording_from(folder: Path, fault: Fault, seed: int) -> Recording:
         gnss_rate=round(1.0 / float(np.median(np.diff(drive["fix_t"])))),
     )
     no_bias = np.zeros((np.count_nonzero(samples.kept), 3))
-    return Recording(
+    return IndependentRecording(
         **vars(said),
         name=fault.scenario,
         seed=seed,
@@ -109,24 +124,17 @@ def recording_from(folder: Path, fault: Fault, seed: int) -> Recording:
         truth_attitude_body_to_map=attitude.as_quat()[:, [3, 0, 1, 2]],
         truth_angular_rate_body=np.gradient(np.unwrap(attitude.as_euler("xyz"), axis=0), 0.1, axis=0),
         frame=frame,
+        noise={f"imu.{name}": float(drive[name].flat[0]) for name in NOISE},
     )
-
-
-def noise_of(folder: Path, fault: Fault, seed: int) -> dict[str, float]:
-    """Return the parameters of the noise of the drive's IMU, as its file states them."""
-    names = FILES[fault.scenario.partition(":")[0]]
-    drive = _drive(folder, names[seed % len(names)])
-    return {f"imu.{name}": float(drive[name].flat[0]) for name in NOISE}
 
 
 def _attitude(drive: dict[str, Array], part: slice) -> Rotation:
     """Attitude, body (forward, left, up) to east, north, up; pitch is positive nose up in the files."""
     heading = drive["truth_heading_deg"][part]
-    roll, pitch = (drive.get(f"truth_{name}_deg", np.zeros_like(drive["truth_heading_deg"]))[part] for name in RP)
+    roll, pitch = (
+        drive.get(f"truth_{name}_deg", np.zeros_like(drive["truth_heading_deg"]))[part] for name in ("roll", "pitch")
+    )
     return Rotation.from_euler("ZYX", np.column_stack([90.0 - heading, -pitch, roll]), degrees=True)
-
-
-RP = ("roll", "pitch")
 
 
 def _said(
@@ -173,9 +181,3 @@ def _said(
     for episode, stream in zip(episodes, streams):
         said = changed_messages(said, episode, stream)
     return said
-
-
-def heading_deg(recording: Recording) -> float:
-    """Return the heading at the start, counter-clockwise from east."""
-    w, x, y, z = recording.truth_attitude_body_to_map[0].tolist()
-    return math.degrees(math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from campaign.causes import is_named, is_wrong
 from campaign.fault import Fault, Filter, Kind
-from campaign.running import MOVES, TURNS, Trace
+from campaign.running import MOVES, RAISED, TURNS, Trace
 
 Array = NDArray[np.float64]
 
@@ -200,6 +200,8 @@ class Row:
             found.append(f"named {100.0 * self.named():.0f} %")
         if self.blamed() > WRONG:
             found.append(f"wrong cause {100.0 * self.blamed():.0f} %")
+        if any(text.startswith(RAISED) for run in self.runs for text in run.said):
+            found.append("raises")
         return found
 
     def named(self) -> float:

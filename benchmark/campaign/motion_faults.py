@@ -9,7 +9,6 @@ from campaign.fault import DEFAULT_VELOCITY, MOVING, TOLD_VELOCITY, Fault, Kind
 from campaign.imu_faults import ROUGH
 from eskf_ros.simulate.dual_antenna import DualAntenna
 from eskf_ros.simulate.gnss_episodes import RtkSolution
-from eskf_ros.simulate.scenarios import scenario
 
 WITH_VELOCITY = (TOLD_VELOCITY, DEFAULT_VELOCITY)
 RTK = RtkSolution(0.0, math.inf)
@@ -21,14 +20,6 @@ MANY_SEEDS = 50
 def _motion(name: str, move: str, stop: float, **more: object) -> Fault:
     usual: dict[str, object] = {"begin": MOVING, "scenario": move, "stop": stop, "filters": WITH_VELOCITY}
     return Fault(name, Kind.MOTION, **{**usual, **more})  # type: ignore[arg-type]
-
-
-def _given(move: str, wrong_deg: float, std_deg: float) -> dict[str, object]:
-    """Parameters that give the heading at the start, so much off."""
-    return {
-        "alignment.initial_heading_deg": scenario(move).heading_deg + wrong_deg,
-        "alignment.initial_heading_std_deg": std_deg,
-    }
 
 
 def _honestly_given(fault: Fault, std_deg: float) -> Fault:
@@ -47,7 +38,8 @@ def motion_faults() -> list[Fault]:
             "straight:33",
             300.0,
             begin=0.0,
-            parameters=_given("straight:33", 25.0, 5.0),
+            given_heading_std_deg=5.0,
+            given_heading_off_deg=25.0,
             also=("given heading",),
         ),
         *(

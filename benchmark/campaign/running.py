@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
+from campaign import independent
 from campaign.fault import RATE, Fault, Filter
 from eskf_ros.filter.history.records import RECORD
 from eskf_ros.filter.navigator import Navigator
@@ -18,7 +20,6 @@ from eskf_ros.filter.state.enums import SENSOR_STREAMS, Stream, Verdict
 from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.imu import ImuMount
 from eskf_ros.simulate.scenario import Recording, simulate
-from eskf_ros.simulate.scenarios import scenario
 from eskf_ros.tables.feeding import rows_from
 from monte_carlo import NO_SIDE_SLIP, Message, feed, messages_of
 
@@ -27,6 +28,8 @@ Mask = NDArray[np.bool_]
 
 IMU_NOISE = ("gyro_noise_density", "accel_noise_density", "gyro_bias_random_walk", "accel_bias_random_walk")
 """Parameters that the told filter knows and the default one does not."""
+
+RAISED = "asked for its complaints, the filter raises"
 
 ASKED_EVERY = 5
 """s between two looks at what the filter says."""
@@ -78,14 +81,22 @@ CARS = ("drive", "hour_drive", "tunnel_drive", "stand", "straight", "creep", "tr
 """Scenarios, or their families, in which what moves points where it goes: the filter is told so."""
 
 
+def heading_at_start_deg(recording: Recording) -> float:
+    """Return the true heading at the start, counter-clockwise from east."""
+    w, x, y, z = recording.truth_attitude_body_to_map[0].tolist()
+    return math.degrees(math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+
+
 def parameters_of(fault: Fault, recording: Recording, is_told: bool) -> dict[str, Any]:
     """Parameters of the recording, changed by the fault; without the noise of the IMU where it is not told."""
     parameters = recording.parameters()
-    if fault.scenario.partition(":")[0] in CARS:
+    if fault.scenario.partition(":")[0] in CARS and not isinstance(recording, independent.IndependentRecording):
         parameters.update(NO_SIDE_SLIP)
     if std := fault.given_heading_std_deg:
-        off = std * np.random.default_rng(10_000 + recording.seed).standard_normal()
-        parameters["alignment.initial_heading_deg"] = scenario(fault.scenario).heading_deg + off
+        off = fault.given_heading_off_deg
+        if off is None:
+            off = std * np.random.default_rng(10_000 + recording.seed).standard_normal()
+        parameters["alignment.initial_heading_deg"] = heading_at_start_deg(recording) + off
         parameters["alignment.initial_heading_std_deg"] = std
     if not is_told:
         parameters = {name: value for name, value in parameters.items() if name.removeprefix("imu.") not in IMU_NOISE}
@@ -97,8 +108,10 @@ def parameters_of(fault: Fault, recording: Recording, is_told: bool) -> dict[str
     return parameters
 
 
-def recording_of(fault: Fault, seed: int) -> Recording:
-    """Simulate the drive of a fault."""
+def recording_of(fault: Fault, seed: int, drives: Path | None = None) -> Recording:
+    """Return the drive of a fault: simulated, or from the folder ``drives`` of the other generator."""
+    if drives is not None:
+        return independent.recording_from(drives, fault, seed)
     options = {"imu_rate": RATE, "stop": fault.stop, "episodes": fault.episodes, **fault.options}
     return simulate(fault.scenario, seed, **options)
 
@@ -146,16 +159,20 @@ def run_one(
             for sentence in sentences(navigator):
                 said.setdefault(sentence, float(taken[stops[k]]))
     records.append(navigator.finish())
+    final = () if any(sentence.startswith(RAISED) for sentence in sentences(navigator)) else tuple(navigator.complaints)
     for sentence in sentences(navigator):
         said.setdefault(sentence, float(taken[-1]))
     if not states:  # The filter never started: it claims nothing, and has nothing but its word.
         states.append(state.copy())
-    return _trace(recording, navigator, stops, np.array(states), np.concatenate(records, dtype=RECORD), said)
+    return _trace(recording, navigator, stops, np.array(states), np.concatenate(records, dtype=RECORD), said, final)
 
 
 def sentences(navigator: Navigator) -> list[str]:
     """What the filter says at present, numbers left out, so that one that grows is the same sentence."""
-    found = [*navigator.complaints, *navigator.notes]
+    try:
+        found = [*navigator.complaints, *navigator.notes]
+    except np.linalg.LinAlgError as problem:
+        found = [f"{RAISED}: {problem}"]
     return [" ".join("".join(" " if c.isdigit() else c for c in text).split()) for text in found]
 
 
@@ -166,15 +183,16 @@ def _trace(
     states: np.ndarray,
     records: np.ndarray,
     said: dict[str, float],
+    final: tuple[str, ...],
 ) -> Trace:
     stops = stops[len(stops) - len(states) :]
-    truth = np.searchsorted(recording.truth_stamp, recording.imu_taken[stops])
-    truth = np.minimum(truth, len(recording.truth_stamp) - 1)
+    start = recording.truth_stamp[0]
+    truth_seconds = (recording.truth_stamp - start) * 1e-9
+    seconds = np.clip((recording.imu_taken[stops] - start) * 1e-9, 0.0, truth_seconds[-1])
     mount = ImuMount(recording.options.imu_position, recording.options.imu_rpy_deg)
-    body_to_map = Rotation.from_quat(recording.truth_attitude_body_to_map[truth][:, [1, 2, 3, 0]])
-    # At slow rates of the truth a stop may lie a moment before: the way of that moment does not count.
-    late = (recording.imu_taken[stops] - recording.truth_stamp[truth]) * 1e-9
-    position = recording.truth_position_map[truth] + late[:, None] * recording.truth_velocity_map[truth]
+    attitudes = Rotation.from_quat(recording.truth_attitude_body_to_map[:, [1, 2, 3, 0]])
+    body_to_map = Slerp(truth_seconds, attitudes)(seconds)
+    position = np.column_stack([np.interp(seconds, truth_seconds, axis) for axis in recording.truth_position_map.T])
     position = position + body_to_map.apply(mount.position)
     imu_to_map = body_to_map * Rotation.from_matrix(mount.rotation_imu_to_body)
     turn = (imu_to_map * Rotation.from_quat(states["attitude"][:, [1, 2, 3, 0]]).inv()).as_rotvec()
@@ -190,25 +208,25 @@ def _trace(
     rate = np.linalg.norm(recording.truth_angular_rate_body, axis=1)
 
     def at(stamps: NDArray[np.int64], quantity: Array) -> Array:
-        return np.interp(stamps, recording.truth_stamp, quantity)
+        return np.interp((stamps - start) * 1e-9, truth_seconds, quantity)
 
     return Trace(
-        seconds=(recording.imu_taken[stops] - recording.truth_stamp[0]) * 1e-9,
+        seconds=seconds,
         error=np.hypot(away[:, 0], away[:, 1]),
         sigma=np.sqrt(np.maximum(covariance[:, 0, 0] + covariance[:, 1, 1], 1e-12)),
         heading_error=turn[:, 2],
         heading_sigma=sigma,
         is_known=is_known,
-        speed=speed[truth],
-        turn=rate[truth],
+        speed=at(recording.imu_taken[stops], speed),
+        turn=at(recording.imu_taken[stops], rate),
         restarts=navigator.restarts,
         resets=navigator.position_resets,
         thrown_away=int(np.count_nonzero(was_known & ~is_known[1:])),
         said=said,
-        final=tuple(navigator.complaints),
+        final=final,
         offered=len(aids),
         refused=int(np.count_nonzero(~np.isin(aids["verdict"], (Verdict.FUSED, Verdict.WEIGHED_DOWN)))),
-        rest=(rest - recording.truth_stamp[0]) * 1e-9,
+        rest=(rest - start) * 1e-9,
         rest_speed=at(rest, speed),
         rest_turn=at(turning, rate),
     )

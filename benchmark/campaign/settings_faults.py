@@ -75,7 +75,8 @@ def settings_faults(amplitude: float = 1.0) -> list[Fault]:
         *(
             _fault(
                 f"heading given {wrong:g} deg wrong",
-                parameters={"alignment.initial_heading_deg": 35.0 + wrong},
+                given_heading_std_deg=5.0,
+                given_heading_off_deg=wrong,
                 settles=60.0,
                 also=("given heading",),
             )
