@@ -129,9 +129,10 @@ def main() -> int:
     bars = table(("bar", "rows ok", "rows"), summary(rows))
     print(text, bars, sep="\n")
     if options.out is not None:
+        how = " --quick" * options.quick + f" --generator {options.generator}" * (drives is not None)
         lead = (
-            f"Written by `python benchmark/faults.py --out docs/trust.md`, {seeds} seeds a row; its first lines say "
-            "how the columns are counted.\n\n"
+            f"Written by `python benchmark/faults.py{how} --out docs/trust.md`, {seeds} seeds a row; its first lines "
+            "say how the columns are counted.\n\n"
         )
         replace_section(options.out, "Bars", lead + bars)
         replace_section(options.out, "Faults", text)
