@@ -16,6 +16,7 @@ from eskf_ros.filter.integrity.installation_monitor import find_faults, learn_fa
 from eskf_ros.filter.integrity.receiver import fuse_receiver, reset_for_new_solution
 from eskf_ros.filter.integrity.receiver_monitor import watch_receiver
 from eskf_ros.filter.integrity.recovery import note, recover
+from eskf_ros.filter.integrity.repeated_fixes import is_repeated, note_copy, note_fused_fix
 from eskf_ros.filter.measurements import (
     baro,
     body_velocity,
@@ -62,6 +63,10 @@ def fuse(states, aids, i, settings, work):
     if not open_record(aids, i):
         return
     aid = aids[i]
+    if is_repeated(state, aid):
+        aid.verdict = Verdict.REPEATED
+        note_copy(state, aid, settings)
+        return
     if aid.stream == Stream.GNSS_POSITION:
         gnss_position.fill_altitude(state, aid.payload, aid.source, settings)
     update_motion_evidence(state, aid, settings)
@@ -105,6 +110,7 @@ def offer(states, aid, heading_before, settings, work):
     if aid.verdict == Verdict.FUSED and state.heading_known == 0:
         search_heading(state, aid, gate, settings, work)
     if aid.stream == Stream.GNSS_POSITION:
+        note_fused_fix(state, aid)
         mag.note_field(state, aid, mag.FIELD)
     elif aid.stream == Stream.WHEEL:
         watch_wheels(state, aid)

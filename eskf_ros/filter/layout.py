@@ -24,6 +24,7 @@ from eskf_ros.filter.integrity.imu_monitor import IMU_MONITOR
 from eskf_ros.filter.integrity.installation_monitor import FAULTS, INSTALLATION
 from eskf_ros.filter.integrity.receiver_monitor import RECEIVER_MONITOR
 from eskf_ros.filter.integrity.recovery import RECOVERY
+from eskf_ros.filter.integrity.repeated_fixes import REPEATED_FIXES
 from eskf_ros.filter.integrity.scatter import SCATTER
 from eskf_ros.filter.measurements.mag import EARTH_FIELD
 from eskf_ros.filter.output.local_odometry import STEP
@@ -96,6 +97,7 @@ STATE = np.dtype(
         ("tight", TIGHT),
         ("streams", STREAMS),
         ("scatter", SCATTER),
+        ("repeats", REPEATED_FIXES),
     ],
     align=True,
 )
@@ -245,6 +247,7 @@ _NEVER = {
         "fused_stamp",
         "fused_since",
     ),
+    "repeats": ("fix_stamp",),
     "receiver": (
         "departure_stamp",
         "seen_stamp",

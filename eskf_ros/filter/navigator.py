@@ -8,15 +8,17 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
 from eskf_ros.filter.alignment.first_fix import reset_pose
 from eskf_ros.filter.alignment.heading_search import forget_search
 from eskf_ros.filter.alignment.warm_start import Memory
-from eskf_ros.filter.history.admission import ABSENT, admit
+from eskf_ros.filter.history.admission import ABSENT, VARIANCES, admit
 from eskf_ros.filter.history.arguments import FloatArray, StampArray, copied, nine, vectors, whole_stamp, whole_stamps
 from eskf_ros.filter.history.buffers import IMU_BATCH, Buffers
+from eskf_ros.filter.history.clock_steps import ClockSteps, Sample
 from eskf_ros.filter.history.records import AID, RECORD
 from eskf_ros.filter.history.timeline import (
     insert_imu,
@@ -34,6 +36,7 @@ from eskf_ros.filter.measurements.heading import UNKNOWN_ANGLE_VARIANCE
 from eskf_ros.filter.output.global_odometry import ODOMETRY
 from eskf_ros.filter.output.local_odometry import LOCAL, note_jump
 from eskf_ros.filter.readout import Readout
+from eskf_ros.filter.rows import ROWS
 from eskf_ros.filter.settings import intakes_from, recall, settings_from
 from eskf_ros.filter.state.enums import Stream, Verdict
 from eskf_ros.filter.state.memory import allocate
@@ -51,10 +54,18 @@ from eskf_ros.parameters.tree import Parameters
 HIGHEST_ALTITUDE = 1e5
 """m; no receiver on a robot reports more."""
 
+NULL_ISLAND = 5e-8
+"""deg; a fix within 5 mm of latitude and longitude zero was never filled in: that place is in the sea."""
+
 ORIENTATION_SHARE = SECOND // 10
 """ns; the IMU's own orientation is used in this part of each second: at least one sample, from 10 Hz on."""
 
 DIAGONAL = np.eye(3).ravel()
+
+MEASURED_AXES = {
+    row.stream: range(3 if row.is_vector else len(row.columns) - bool(row.optional_column)) for row in ROWS
+}
+"""Axes that a message of a stream is expected to measure."""
 
 
 NO_FIELD = (0.0, 0.0, 0.0, 0.0)
@@ -110,6 +121,7 @@ class Navigator(Readout):
         self._local = allocate(LOCAL)
         self._refused: list[np.ndarray] = []
         self._traffic = Traffic()
+        self._clock = ClockSteps()
         self.range_statuses: Counter[RangeStatus] = Counter()
         """Number of signals by status: usable, or why they never entered the timeline."""
 
@@ -123,7 +135,8 @@ class Navigator(Readout):
 
         This is a barrier: what came before is final, and nothing older is accepted afterwards.
         """
-        self.update()
+        self._release_held()
+        self._advance()
         state = self._states[0]
         if not state["position_known"]:
             return False
@@ -134,7 +147,8 @@ class Navigator(Readout):
 
     def set_datum(self, latitude_deg: float, longitude_deg: float, altitude: float) -> None:
         """Make a geodetic position (deg, deg, m) the origin of the map, wherever the robot is. This is a barrier."""
-        self.update()
+        self._release_held()
+        self._advance()
         state, settings = self._states[0], self._settings[0]
         position, heading = tuple(state["position_map"]), heading_of(state, settings)
         datum = math.radians(latitude_deg), math.radians(longitude_deg), float(altitude)
@@ -154,7 +168,8 @@ class Navigator(Readout):
         ``heading`` is counter-clockwise from x of map, ``heading_std`` its standard deviation (rad). Returns False
         while level or datum are unknown. This is a barrier.
         """
-        self.update()
+        self._release_held()
+        self._advance()
         state, settings = self._states[0], self._settings[0]
         if not (state["level_known"] and state["frame"]["datum_known"]):
             return False
@@ -167,10 +182,19 @@ class Navigator(Readout):
         self._raise_barrier()
         return True
 
-    def push_imu(self, stamps: StampArray, specific_force: FloatArray, angular_rate: FloatArray) -> np.ndarray:
+    def push_imu(
+        self,
+        stamps: StampArray,
+        specific_force: FloatArray,
+        angular_rate: FloatArray,
+        arrivals: StampArray | None = None,
+    ) -> np.ndarray:
         """Take IMU samples, shapes (n,), (n, 3) m/s2, (n, 3) rad/s in IMU axes, and run the filter up to the newest.
 
         Returns the ODOMETRY rows of the newly processed samples on the output grid, as they would have been published.
+        ``arrivals`` (n,): when they came (ns), on a clock that nobody sets; they tell a clock that was set forward from
+        a silent IMU (`history.clock_steps`). Samples that seem to come from a clock that was set are held until some
+        more have come.
 
         Raises:
             TypeError: the stamps are not integers: seconds as floats cannot hold nanoseconds.
@@ -179,27 +203,83 @@ class Navigator(Readout):
         stamps = whole_stamps(stamps)
         specific_force = vectors("specific_force", specific_force, len(stamps))
         angular_rate = vectors("angular_rate", angular_rate, len(stamps))
+        arrivals = None if arrivals is None else whole_stamps(arrivals)
+        if not self._local["started"][0] or self._clock.is_plain(stamps, arrivals):
+            return self._given_out(self._push_samples(stamps, specific_force, angular_rate, arrivals))
+        parts = []
+        for k in range(len(stamps)):
+            sample = Sample(
+                int(stamps[k]), specific_force[k], angular_rate[k], 0 if arrivals is None else int(arrivals[k])
+            )
+            false, taken = self._clock.take(sample, self._kept_samples)
+            self._buffers.timeline["imu_offered"] += len(false)
+            self._buffers.timeline["imu_bad_stamp"] += len(false)
+            parts.append(self._push_held(taken))
+        return np.concatenate([np.zeros(0, ODOMETRY), *parts])
+
+    def _push_held(self, samples: Sequence[Sample]) -> np.ndarray:
+        """Give samples that are not, or no longer, held to the timeline, and the measurements that waited with them."""
+        if not samples:
+            return np.zeros(0, ODOMETRY)
+        arrivals = np.array([sample.arrival for sample in samples], np.int64)
+        rows = self._push_samples(
+            np.array([sample.stamp for sample in samples], np.int64),
+            np.array([sample.force for sample in samples]),
+            np.array([sample.rate for sample in samples]),
+            arrivals if arrivals.all() else None,
+        )
+        if not self._clock.held:
+            waiting, self._clock.held_aids = self._clock.held_aids, []
+            for offer in waiting:
+                offer()
+        return self._given_out(rows)
+
+    def _release_held(self) -> None:
+        """Give all samples that are held to the timeline: something has to be final now."""
+        self._push_held(self._clock.release())
+
+    def _kept_samples(self) -> np.ndarray:
+        return self._buffers.imu[: int(self._buffers.timeline["imu_count"][0])]
+
+    def _given_out(self, rows: np.ndarray) -> np.ndarray:
+        """Return rows or records with the stamps of the clock of then."""
+        if self._clock.steps and len(rows):
+            rows["stamp"] = self._clock.stamps_of(rows["stamp"])
+        return rows
+
+    def _push_samples(
+        self, stamps: StampArray, specific_force: FloatArray, angular_rate: FloatArray, arrivals: StampArray | None
+    ) -> np.ndarray:
+        """Sort IMU samples into the timeline, with the shift of the clock, and run the filter; return new rows."""
         parts = []
         first = 0
-        while first < len(stamps):
+        times = stamps + self._clock.shift
+        while first < len(times):
             self._make_room()
-            batch = min(first + IMU_BATCH, len(stamps))
+            batch = min(first + IMU_BATCH, len(times))
             first = insert_imu(
                 self._buffers.imu,
                 self._buffers.aids,
                 self._buffers.timeline,
                 self._local,
                 self._settings,
-                stamps[:batch],
+                times[:batch],
                 specific_force,
                 angular_rate,
                 first,
             )
-            parts.append(self.update())
+            parts.append(self._advance())
+        if len(stamps):
+            delay, arrival = (0, 0) if arrivals is None else (int((arrivals - stamps).min()), int(arrivals[-1]))
+            self._clock.note(int(self._buffers.timeline["frontier"][0]), len(stamps), delay, arrival)
         return parts[0] if len(parts) == 1 else np.concatenate([np.zeros(0, ODOMETRY), *parts])
 
     def update(self) -> np.ndarray:
         """Apply what was pushed, late messages included; return rows as `push_imu` does."""
+        return self._given_out(self._advance())
+
+    def _advance(self) -> np.ndarray:
+        """Run the filter over what waits; return the new rows, with times of the timeline."""
         count = advance(
             self._states,
             self._buffers.imu,
@@ -259,6 +339,8 @@ class Navigator(Readout):
         if door == Verdict.WAITING:
             if status < 0:
                 door = Verdict.NO_FIX
+            elif abs(latitude_deg) < NULL_ISLAND and abs(longitude_deg) < NULL_ISLAND:
+                door = Verdict.UNFILLED
             elif abs(latitude_deg) > 90.0 or abs(longitude_deg) > 360.0 or abs(altitude) > HIGHEST_ALTITUDE:
                 door = Verdict.BAD_VALUE
             else:
@@ -322,12 +404,15 @@ class Navigator(Readout):
         Raises:
             TypeError: the stamp is not an integer.
         """
+        if self._clock.held:
+            self._clock.held_aids.append(partial(self.push_ranges, stamp, instant, signals, klobuchar, arrival, place))
+            return
         field = NO_FIELD if place is None or not self.needs_field else self._field_at(*place, stamp)
         self.range_statuses.update(status_counts(signals))
         is_tight, ranges = self.parameters.mode == "tight", self.parameters.ranges
         code_door = Verdict.WAITING if is_tight and ranges.use else Verdict.DISABLED
         rate_door = Verdict.WAITING if is_tight and ranges.use_doppler else Verdict.DISABLED
-        stamp = whole_stamp(stamp) + round(ranges.time_offset * SECOND)
+        stamp = self._clock.time_of(Stream.PSEUDORANGE, whole_stamp(stamp) + round(ranges.time_offset * SECOND))
         self._make_room(2 * len(signals))
         refused = np.zeros(2 * len(signals), RECORD)
         count = offer_signals(
@@ -380,19 +465,20 @@ class Navigator(Readout):
 
     def take_records(self) -> np.ndarray:
         """Return the records (RECORD) that became final since the last call: in the total order, the late ones last."""
-        return self._take_records(False)
+        return self._given_out(self._take_records(False))
 
     def take_live(self) -> np.ndarray:
         """Return the records of what was judged since the last call, as they stand: a late message may change them."""
         judged = self._buffers.aids[: int(self._states["aid_next"][0])]
         new = np.flatnonzero((judged["told"] == 0) & (judged["verdict"] != Verdict.INACTIVE))
         judged["told"] = 1
-        return np.array([tuple(judged[name][i] for name in RECORD.names or ()) for i in new], RECORD)
+        return self._given_out(np.array([tuple(judged[name][i] for name in RECORD.names or ()) for i in new], RECORD))
 
     def finish(self) -> np.ndarray:
         """End the data: return all remaining records; the verdict WAITING means that no IMU sample came for them."""
-        self.update()
-        return self._take_records(True)
+        self._release_held()
+        self._advance()
+        return self._given_out(self._take_records(True))
 
     def _take(self, stream: Stream, values: Sequence[float], covariance: Sequence[float] | FloatArray) -> int:
         """Fill the payload on offer, with a stand-in for a missing covariance; return its admission verdict."""
@@ -424,6 +510,9 @@ class Navigator(Readout):
             return Verdict.BAD_VALUE
         if stand_in is not NO_STAND_IN:
             self._traffic.stand_ins += 1
+        for axis in MEASURED_AXES[stream] if lacks else ():
+            if self._offered[0]["payload"][VARIANCES[axis]] == ABSENT:
+                self._traffic.lacking[stream, axis] += 1
         return Verdict.WAITING
 
     def _field_at(
@@ -459,12 +548,24 @@ class Navigator(Readout):
     def _push_aid(self, stream: Stream, stamp: int, arrival: int, source: int, door: int) -> None:
         """Sort the record on offer into the timeline."""
         stamp = whole_stamp(stamp)
+        if self._clock.held:
+            self._clock.held_aids.append(
+                partial(self._push_offer, self._offered.copy(), stream, stamp, arrival, source, door)
+            )
+        else:
+            self._push_offer(self._offered, stream, stamp, arrival, source, door)
+
+    def _push_offer(
+        self, offered: np.ndarray, stream: Stream, stamp: int, arrival: int, source: int, door: int
+    ) -> None:
+        """Sort a record whose payload is filled into the timeline."""
+        stamp = self._clock.time_of((stream, source), stamp)
         self._traffic.offered[stream] += 1
         if door != Verdict.WAITING:
             self._traffic.shut_doors[stream, Verdict(door)] += 1
         self._make_room()
         refused = offer_aid(
-            self._buffers.aids, self._buffers.timeline, self._offered, stamp, arrival, int(stream), source, int(door)
+            self._buffers.aids, self._buffers.timeline, offered, stamp, arrival, int(stream), source, int(door)
         )
         if refused:
             self._refuse(stream, stamp, arrival, source, Verdict(refused))
@@ -490,11 +591,12 @@ class Navigator(Readout):
         )
         count = take_final(self._buffers.aids, self._buffers.timeline, records, everything)
         refused, self._refused = self._refused, []
+        self._traffic.note_final(records[:count])
         return np.concatenate([np.array(records[:count], RECORD), *refused])
 
     def _forget(self) -> None:
         """Process what waits, and drop what no accepted message can change any more."""
-        self.update()
+        self._advance()
         self._buffers.forget(self._states)
 
     def _make_room(self, aids: int = 1) -> None:

@@ -9,12 +9,14 @@ import numpy as np
 from eskf_ros.filter.alignment.warm_start import Memory
 from eskf_ros.filter.history.arguments import copied
 from eskf_ros.filter.history.buffers import Buffers
+from eskf_ros.filter.history.clock_steps import ClockSteps, Step
 from eskf_ros.filter.history.records import RECORD
 from eskf_ros.filter.integrity.heading_monitor import is_heading_contradicted
 from eskf_ros.filter.integrity.receiver_report import aid_complaints
 from eskf_ros.filter.integrity.recovery import phase_of
+from eskf_ros.filter.integrity.repeated_fixes import repeat_complaints
 from eskf_ros.filter.integrity.report import complaints
-from eskf_ros.filter.integrity.traffic import Traffic
+from eskf_ros.filter.integrity.traffic import Traffic, imu_complaints
 from eskf_ros.filter.layout import STATE
 from eskf_ros.filter.output.global_odometry import ODOMETRY, status_of, write_odometry
 from eskf_ros.filter.state.enums import Phase, Status, Stream
@@ -33,17 +35,19 @@ class Readout:
     _local: np.ndarray
     _buffers: Buffers
     _traffic: Traffic
+    _clock: ClockSteps
 
     @property
     def odometry(self) -> np.ndarray:
         """One ODOMETRY row of the state at the newest IMU sample (array of length one)."""
         row = allocate(ODOMETRY)
         write_odometry(self._states[0], self._local[0], self._settings[0], row[0])
+        row["stamp"] = self._clock.stamps_of(row["stamp"])
         return copied(row, 1)
 
     @property
     def state(self) -> np.ndarray:
-        """A copy of the whole state (STATE, array of length one)."""
+        """A copy of the whole state (STATE, array of length one), in times of the timeline (`history.clock_steps`)."""
         return np.array(self._states[:1], STATE)
 
     @property
@@ -112,7 +116,9 @@ class Readout:
         judged = self._buffers.aids[: int(self._states["aid_next"][0])]
         codes = judged[judged["stream"] == Stream.PSEUDORANGE]
         newest = codes[codes["stamp"] == codes["stamp"].max(initial=NEVER)]
-        return np.array([tuple(row[name] for name in RECORD.names or ()) for row in newest], RECORD)
+        records = np.array([tuple(row[name] for name in RECORD.names or ()) for row in newest], RECORD)
+        records["stamp"] = self._clock.stamps_of(records["stamp"])
+        return records
 
     @property
     def clock_jumps(self) -> int:
@@ -129,6 +135,11 @@ class Readout:
         """IMU samples offered, and refused or replaced by reason."""
         names = ("offered", "duplicate", "late", "bad_value", "bad_stamp")
         return {name: int(self._buffers.timeline[f"imu_{name}"][0]) for name in names}
+
+    @property
+    def clock_steps(self) -> list[Step]:
+        """When the clock of the IMU's stamps was set, and by how much."""
+        return list(self._clock.steps)
 
     @property
     def waiting(self) -> int:
@@ -158,11 +169,16 @@ class Readout:
     def complaints(self) -> list[str]:
         """One sentence for each fault of a stream, with what to do; empty without faults."""
         state = self._states[0]
-        found = complaints(state)
+        found = complaints(state) + repeat_complaints(state)
         # A wrong heading makes the fixes look faulty: warnings about the receivers would mislead.
         if not is_heading_contradicted(state):
             found += aid_complaints(state, self._settings[0])
-        return found + self._traffic.complaints()
+        return (
+            found
+            + self._clock.complaints()
+            + self._traffic.complaints()
+            + imu_complaints(self.imu_counts, self.window_needed)
+        )
 
     @property
     def notes(self) -> list[str]:

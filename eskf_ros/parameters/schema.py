@@ -67,6 +67,11 @@ TOPIC_NAME = {
 }
 """Limits of a parameter that names a topic."""
 
+TIME_OFFSET = {"minimum": -1.0e7, "maximum": 1.0e7}
+"""Limits of a time offset (s): a counter of milliseconds in 32 bits overflows after 4294967 s, and it may make up for
+that.
+"""
+
 TYPE_OF_TOPIC = (
     "Message type of this topic, where the driver publishes another one. The replay takes what was recorded."
 )
@@ -78,9 +83,7 @@ class Aid:
     """Parameters that every sensor has: the fields of its group begin with these."""
 
     use: bool = parameter(True, "", "Fuse the messages of this topic.", live=True)
-    time_offset: float = parameter(
-        0.0, "s", "Added to the stamps: true time = stamp + offset.", minimum=-10.0, maximum=10.0
-    )
+    time_offset: float = parameter(0.0, "s", "Added to the stamps: true time = stamp + offset.", **TIME_OFFSET)
     covariance_scale: float = parameter(
         1.0,
         "",

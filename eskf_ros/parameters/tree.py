@@ -20,6 +20,7 @@ from eskf_ros.filter.rows import CONSTRAINTS, SENSORS
 from eskf_ros.filter.tight.signal import Ranges
 from eskf_ros.parameters.schema import (
     FRAME_NAME,
+    TIME_OFFSET,
     TOPIC_NAME,
     TYPE_OF_TOPIC,
     choice,
@@ -237,8 +238,7 @@ class Gnss:
         "s",
         "Added to the stamps of the GNSS messages: true time = stamp + offset. "
         "Negative when the driver stamps a message on arrival.",
-        minimum=-10.0,
-        maximum=10.0,
+        **TIME_OFFSET,
     )
     velocity_time_offset: float = parameter(
         0.0,
@@ -347,8 +347,7 @@ class SecondGnss:
         0.0,
         "s",
         "Added to the stamps of the second receiver's messages: true time = stamp + offset.",
-        minimum=-10.0,
-        maximum=10.0,
+        **TIME_OFFSET,
     )
 
 

@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from eskf_ros.filter.integrity.traffic import late_remedy
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import STREAM_NAMES, Status, Stream, Verdict
 from eskf_ros.geodesy.map_frame import MapFrame, east_north_up_to_ecef, to_geodetic
@@ -151,10 +152,9 @@ class Summary:
         late[topics.imu] = navigator.imu_counts["late"]
         if any(late.values()):
             counts = ", ".join(f"{count} of {name}" for name, count in late.items() if count)
-            lines.append(
-                f"measurements too late for history.window = {parameters.history.window:g} s: {counts}; "
-                f"a window of {navigator.window_needed:.3f} s would have taken them"
-            )
+            window = parameters.history.window
+            remedy = late_remedy(navigator.window_needed)
+            lines.append(f"measurements too late for history.window = {window:g} s: {counts}; {remedy}")
         if not self._rows:
             verdicts = ", ".join(
                 f"{count} {name}" for name, count in named(self._verdicts[Stream.GNSS_POSITION]).items()

@@ -17,7 +17,7 @@ from eskf_ros.geodesy.rotation import cross, rotate, rotate_back, to_matrix
 from eskf_ros.gnss.geometry import line_of_sight
 from eskf_ros.gnss.ranges import ALREADY_TURNED
 from eskf_ros.gnss.signals import LETTERS, SIGNALS, time_group
-from eskf_ros.parameters.schema import Aid, parameter
+from eskf_ros.parameters.schema import TIME_OFFSET, Aid, parameter
 
 MEASURED = 0
 STD = 1
@@ -125,8 +125,7 @@ class Ranges(Aid):
         "s",
         "Added to the stamps: true time = stamp + offset. RINEX files are stamped with UTC: -18 or 18 s may be missing "
         "where a recording is stamped with GPS time.",
-        minimum=-100.0,
-        maximum=100.0,
+        **TIME_OFFSET,
     )
     gate_probability: float = parameter(
         0.99994,
