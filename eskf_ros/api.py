@@ -38,6 +38,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from eskf_ros.filter.history.clock_steps import TRANSITION
 from eskf_ros.filter.history.records import RECORD
 from eskf_ros.filter.history.timeline import EARLY_AIDS, JUMP_CONFIRMATIONS, LARGEST_JUMP
 from eskf_ros.filter.measurements.row import UNMEASURED
@@ -51,6 +52,7 @@ from eskf_ros.parameters.ros_yaml import load
 from eskf_ros.parameters.tree import Parameters
 from eskf_ros.replay.summary import final_result
 from eskf_ros.tables.columns import Array, Stamps, Table, in_order
+from eskf_ros.tables.eras import eras_of
 from eskf_ros.tables.feeding import WIDTH, push_row
 from eskf_ros.tables.results import aid_summary, as_table, innovation_table, trajectory_table
 
@@ -69,6 +71,8 @@ DROPS = {
     Verdict.NON_FINITE: "numbers that are not finite",
     Verdict.BAD_COVARIANCE: "a covariance that is not positive definite",
     Verdict.BAD_VALUE: "values that cannot be true",
+    Verdict.UNFILLED: "latitude and longitude are zero: nobody filled them in",
+    Verdict.REPEATED: "the coordinates of the fix before, bit for bit",
     Verdict.NO_FIX: "the receiver had no fix",
     Verdict.BEFORE_ALIGNMENT: "before the level or the position were known, or too many before the first IMU sample",
     Verdict.DISABLED: "switched off by the parameters",
@@ -97,9 +101,10 @@ class Result:
 
     Attributes:
         trajectory: base_link at the samples of the output grid, each estimated from stamps up to its own. ``stamp`` ns,
-            ``status``, ``position_known``, ``heading_known``, ``latitude_deg``, ``longitude_deg``, ``altitude`` m over
-            the ellipsoid, ``position`` m and ``velocity`` m/s in map (East-North-Up at the datum), ``attitude`` (w x y
-            z, base_link to map), ``position_std`` m, ``rotation_std`` rad. NaN while the position is unknown.
+            ``status``, ``usable`` (for navigation) with its reason ``quality``, ``position_known``, ``heading_known``,
+            ``latitude_deg``, ``longitude_deg``, ``altitude`` m over the ellipsoid, ``position`` m and ``velocity`` m/s
+            in map (East-North-Up at the datum), ``attitude`` (w x y z, base_link to map), ``position_std`` m,
+            ``rotation_std`` rad. NaN while the position is unknown.
         innovations: one row for each measurement: ``aid``, ``stamp`` ns, ``verdict``, ``dof``, ``nis``, ``innovation``
             (3 numbers, NaN beyond ``dof``), the constraints zupt, zaru and nhc included.
         biases: ``stamp``, ``accel_bias`` m/s2, ``gyro_bias`` rad/s, ``accel_bias_std``, ``gyro_bias_std`` in IMU axes.
@@ -121,7 +126,8 @@ class Result:
 class Filter:
     """The filter for tables that come in pieces: push in any order, then `update`.
 
-    The result is the same, bit for bit, in whatever order the tables between two updates are pushed.
+    The result is the same, bit for bit, in whatever order the tables between two updates are pushed. A clock that was
+    set back is recognised within one table, or between two updates.
     """
 
     def __init__(self, parameters: ParametersLike = None, output_rate: float = 0.0) -> None:
@@ -196,14 +202,29 @@ class Filter:
 
         Returns the new ODOMETRY rows (`filter.output.global_odometry`), one for each new IMU sample on the output grid.
         """
-        stamps, imu = in_order(self._imu_parts, 6)
+        eras = eras_of(self._imu_parts, self._aid_parts)
         self._imu_parts = []
-        aids = self._take_aids(int(stamps[-1]) if len(stamps) else None)
+        rows: list[NDArray[Any]] = []
+        for number, (imu_parts, self._aid_parts) in enumerate(eras):
+            rows += self._update_era(imu_parts, is_last=number + 1 == len(eras), is_set=number > 0)
+        # Joined as bytes: numpy copies structured arrays field by field, which takes ten times as long.
+        new = np.frombuffer(b"".join(part.tobytes() for part in rows), ODOMETRY)
+        self._rows.append(new)
+        return new
+
+    def _update_era(self, imu_parts: list[tuple[Stamps, Array]], is_last: bool, is_set: bool) -> list[NDArray[Any]]:
+        """Process what one clock has stamped; return the new rows. ``is_set``: the clock was set back before."""
+        stamps, imu = in_order(imu_parts, 6)
+        if is_set:
+            self._newest = int(stamps[0]) - 1
+        aids = self._take_aids(int(stamps[-1]) if len(stamps) else None, is_last)
         rows: list[NDArray[Any]] = []
         given = first = 0
         while first < len(stamps):
             previous = int(stamps[first - 1]) if first else self._newest
+            # The IMU must confirm a jump first: the measurements would be refused, or taken for those of the old clock.
             is_jump = previous is not None and int(stamps[first]) - previous > LARGEST_JUMP
+            is_jump = is_jump or (is_set and int(stamps[first] - stamps[0]) < 2 * TRANSITION)
             end = _end_of_chunk(stamps, first, is_jump)
             until = given
             while until < len(aids) and aids[until][0] <= stamps[end - 1]:
@@ -213,7 +234,6 @@ class Filter:
                 np.ascontiguousarray(imu[first:end, :3]),
                 np.ascontiguousarray(imu[first:end, 3:]),
             )
-            # After a jump the IMU must confirm it first: the measurements would be refused as far ahead of it.
             if is_jump:
                 rows.append(self._navigator.push_imu(*chunk))
             self._give(aids[given:until], previous is None)
@@ -224,10 +244,7 @@ class Filter:
         rows.append(self._navigator.update())
         if len(stamps):
             self._newest = max(int(stamps[-1]), self._newest or 0)
-        # Joined as bytes: numpy copies structured arrays field by field, which takes ten times as long.
-        new = np.frombuffer(b"".join(part.tobytes() for part in rows), ODOMETRY)
-        self._rows.append(new)
-        return new
+        return rows
 
     def result(self) -> Result:
         """Process what was pushed and return all results so far; more may be pushed afterwards."""
@@ -332,14 +349,18 @@ class Filter:
         self._note(name, table, stamps)
         self._aid_parts[name].append((stamps, rows))
 
-    def _take_aids(self, newest: int | None) -> list[tuple[int, str, int, Array]]:
-        """Take the measurements not newer than the IMU: (stamp on its clock, input, own stamp, row), sorted."""
+    def _take_aids(self, newest: int | None, is_last: bool) -> list[tuple[int, str, int, Array]]:
+        """Take the measurements not newer than the IMU: (stamp on its clock, input, own stamp, row), sorted.
+
+        No IMU sample comes any more for those of a clock that is not the last: they are taken all.
+        """
         limit = max((stamp for stamp in (newest, self._newest) if stamp is not None), default=None)
         taken: list[tuple[int, str, int, Array]] = []
         for name, parts in self._aid_parts.items():
             stamps, rows = in_order(parts, WIDTH)
             offset = self._offset(name)
             count = 0 if limit is None else int(np.searchsorted(stamps, limit - offset, "right"))
+            count = count if is_last else len(stamps)
             taken += [(stamp + offset, name, stamp, row) for stamp, row in zip(stamps[:count].tolist(), rows[:count])]
             self._aid_parts[name] = [(stamps[count:], rows[count:])]
         taken.sort(key=lambda item: item[0])

@@ -93,10 +93,21 @@ MESSAGE_TYPES: dict[str, tuple[Field, ...]] = {
 """The messages with fixed fields; those of `POINT_CLOUD` have variable ones, see `eskf_ros.bags.clouds`."""
 
 
+UNCARRIED = (
+    "have a second or more in header.stamp.nanosec, and were taken as sec + nanosec: the driver must carry it over, or "
+    "it writes something else there"
+)
+"""What is said of messages with such stamps."""
+
+
 class StringTable:
-    """The distinct strings of a recording; messages hold indices into `values`, which only ever grows."""
+    """The distinct strings of a recording; messages hold indices into `values`, which only ever grows.
+
+    `uncarried` counts the messages that were decoded with it whose stamps have a second or more of nanoseconds.
+    """
 
     def __init__(self, values: Sequence[str] = ()) -> None:
+        self.uncarried = 0
         self.values: list[str] = []
         self._index: dict[str, int] = {}
         for value in values:
@@ -287,7 +298,9 @@ def _decode_into(
         stamp = messages[name]
         stamp[:] = _column(rows, offset, order + "i4")
         stamp *= 1_000_000_000
-        stamp += _column(rows, offset + 4, order + "u4")
+        nanoseconds = _column(rows, offset + 4, order + "u4")
+        strings.uncarried += int(np.count_nonzero(nanoseconds >= 1_000_000_000))
+        stamp += nanoseconds
     for (name, offset), size in zip(layout.lengths.items(), sizes, strict=True):
         messages[name] = _intern(rows[:, offset + 4 : offset + 4 + size], strings)
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from eskf_ros.bags.errors import BagError
 from eskf_ros.bags.mcap_file import MAGIC, McapFile
-from eskf_ros.bags.messages import StringTable, decode, message_dtype
+from eskf_ros.bags.messages import UNCARRIED, StringTable, decode, message_dtype
 from eskf_ros.bags.records import Batch, Block, Payloads, Source, TopicInfo
 from eskf_ros.bags.row_files import RosbagsDirectory, SqliteFile
 
@@ -123,6 +123,7 @@ class BagReader:
     def _batches(self, topics: Mapping[str, str]) -> Iterator[dict[str, Batch]]:
         self.bytes_done = 0
         malformed: dict[str, int] = {}
+        uncarried: dict[str, int] = {}
         misplaced = 0
         pending: dict[str, list[_Piece]] = {topic: [] for topic in topics}
         waiting = 0
@@ -134,7 +135,10 @@ class BagReader:
             loaded = block.load()
             following = next(blocks, None)
             for topic, payloads in loaded.items():
+                already = self._strings.uncarried
                 piece, bad = self._decode(topics[topic], payloads, order)
+                if self._strings.uncarried > already:
+                    uncarried[topic] = uncarried.get(topic, 0) + self._strings.uncarried - already
                 if bad:
                     malformed[topic] = malformed.get(topic, 0) + bad
                 late = int(np.searchsorted(piece.log_time, emitted))
@@ -158,6 +162,8 @@ class BagReader:
                 f"{self._sources[0].name}: "
                 f"{count} messages of topic {topic} cannot be decoded as {topics[topic]}; skipped"
             )
+        for topic, count in uncarried.items():
+            self._own_warnings.append(f"{self._sources[0].name}: {count} messages of topic {topic} {UNCARRIED}")
         if misplaced:
             self._own_warnings.append(
                 f"{self._sources[0].name}: {misplaced} messages lie outside the time range stated in the file; skipped"

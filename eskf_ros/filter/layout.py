@@ -140,6 +140,9 @@ SETTINGS = np.dtype(
         ("course_min_speed", "f8"),
         ("course_std", "f8"),
         ("good_heading_std", "f8"),
+        ("quality_position_std", "f8"),
+        ("quality_coast_time", "f8"),
+        ("quality_settle_time", "f8"),
         # Memory of an earlier run: biases, place and heading of base_link (see ``warm_start``).
         ("has_memory", "i8"),
         ("remembered_accel_bias", "f8", (3,)),

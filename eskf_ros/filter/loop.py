@@ -8,7 +8,7 @@ from eskf_ros.filter.fuse import fuse
 from eskf_ros.filter.history.timeline import rewind, save_checkpoint
 from eskf_ros.filter.inertial.navigation_frame import heading_of
 from eskf_ros.filter.inertial.strapdown import SMOOTHING_TIME
-from eskf_ros.filter.integrity.imu_monitor import watch_input
+from eskf_ros.filter.integrity.imu_monitor import watch_input, watch_interval
 from eskf_ros.filter.integrity.restart import reset_alignment
 from eskf_ros.filter.output.global_odometry import write_odometry
 from eskf_ros.filter.output.local_odometry import carry, measure_step, note_jump
@@ -45,6 +45,7 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
         predict(states, sample.stamp, sample, settings, work)
         take_sample(state, sample)
         states[HUMBLE].imu.interval = state.imu.interval
+        watch_interval(state, settings)
         measure_step(state, settings)
         update_rest(state, settings)
         add_to_block(state, settings)

@@ -18,8 +18,9 @@ from eskf_ros.filter.integrity.repeated_fixes import repeat_complaints
 from eskf_ros.filter.integrity.report import complaints
 from eskf_ros.filter.integrity.traffic import Traffic, imu_complaints
 from eskf_ros.filter.layout import STATE
-from eskf_ros.filter.output.global_odometry import ODOMETRY, status_of, write_odometry
-from eskf_ros.filter.state.enums import Phase, Status, Stream
+from eskf_ros.filter.output.global_odometry import ODOMETRY, write_odometry
+from eskf_ros.filter.output.status import quality_of, status_of
+from eskf_ros.filter.state.enums import Phase, Quality, Status, Stream
 from eskf_ros.filter.state.error_state import ERROR_SIZE, INTER_SYSTEM
 from eskf_ros.filter.state.memory import allocate
 from eskf_ros.filter.state.time import NEVER, SECOND
@@ -54,6 +55,12 @@ class Readout:
     def status(self) -> Status:
         """The `Status` at the newest IMU sample."""
         return Status(status_of(self._states[0], self._settings[0]))
+
+    @property
+    def quality(self) -> Quality:
+        """The `Quality` at the newest IMU sample: whether the estimate may be used for navigation."""
+        state, settings = self._states[0], self._settings[0]
+        return Quality(quality_of(state, status_of(state, settings), settings))
 
     @property
     def memory(self) -> Memory | None:
@@ -140,6 +147,11 @@ class Readout:
     def clock_steps(self) -> list[Step]:
         """When the clock of the IMU's stamps was set, and by how much."""
         return list(self._clock.steps)
+
+    @property
+    def clock_complaints(self) -> list[str]:
+        """A sentence on these steps, with what to do; empty without steps."""
+        return self._clock.complaints()
 
     @property
     def waiting(self) -> int:

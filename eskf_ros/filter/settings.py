@@ -113,6 +113,8 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
     settings["course_min_speed"] = alignment.course_min_speed
     settings["course_std"] = math.radians(alignment.course_std_deg)
     settings["good_heading_std"] = math.radians(alignment.good_heading_std_deg)
+    for name in ("position_std", "coast_time", "settle_time"):
+        settings[f"quality_{name}"] = getattr(parameters.quality, name)
     settings["output_interval"] = round(SECOND / output_rate) if output_rate > 0.0 else 0
     return settings
 

@@ -506,6 +506,34 @@ class Alignment:
 
 
 @dataclass(frozen=True)
+class Quality:
+    position_std: float = parameter(
+        5.0,
+        "m",
+        "Above this horizontal standard deviation (east and north together) the estimate is not usable.",
+        above=0.0,
+        maximum=1.0e6,
+        live=True,
+    )
+    coast_time: float = parameter(
+        10.0,
+        "s",
+        "How long the estimate stays usable without an accepted position, as far as position_std allows.",
+        minimum=0.0,
+        maximum=1.0e6,
+        live=True,
+    )
+    settle_time: float = parameter(
+        5.0,
+        "s",
+        "How long the estimate is not usable after position and velocity were reset to the fixes.",
+        minimum=0.0,
+        maximum=1.0e6,
+        live=True,
+    )
+
+
+@dataclass(frozen=True)
 class WarmStart:
     file: str = parameter(
         "",
@@ -603,5 +631,6 @@ class Parameters:
     estimate: Estimate = group_of(Estimate, "What is estimated besides the motion and the biases of the IMU.")
     history: History = group_of(History, "Late and out-of-order messages.")
     alignment: Alignment = group_of(Alignment, "Start-up: levelling, heading, and when the estimate is called good.")
+    quality: Quality = group_of(Quality, "When the estimate is called usable (eskf/quality).")
     warm_start: WarmStart = group_of(WarmStart, "What the node remembers of its last run.")
     output: Output = group_of(Output, "What the node publishes, and how.")

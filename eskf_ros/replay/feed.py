@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.bags import Batch
+from eskf_ros.filter.history.clock_steps import AHEAD, steps_back
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.output.global_odometry import ODOMETRY
 from eskf_ros.filter.state.enums import Status
@@ -59,7 +60,7 @@ class Feed:
 
     def ordered(self, batches: Iterable[dict[str, Batch]]) -> Iterable[dict[str, Batch]]:
         """Return the batches in the order in which they have to be pushed."""
-        return in_stamp_order(batches) if self._by_stamp else batches
+        return in_stamp_order(batches, self._topics.imu) if self._by_stamp else batches
 
     def push(self, batch: dict[str, Batch]) -> NDArray[Any]:
         """Offer the messages of a batch; return the ODOMETRY rows of its IMU samples, (n,)."""
@@ -80,7 +81,8 @@ class Feed:
                 part = slice(done, min(end, done + LARGEST_PUSH))
                 orientation = imu.messages["orientation"][part], imu.messages["orientation_covariance"][part]
                 self._navigator.push_imu_orientation(stamps[part], *orientation)
-                rows.append(self._navigator.push_imu(stamps[part], specific_force[part], angular_rate[part]))
+                readings = specific_force[part], angular_rate[part]
+                rows.append(self._navigator.push_imu(stamps[part], *readings, imu.log_time[part]))
                 done = part.stop
 
         for place, kind, arguments in self._offers(batch):
@@ -123,16 +125,20 @@ class Feed:
         return [offer for _, offer in offers]
 
 
-def in_stamp_order(batches: Iterable[dict[str, Batch]]) -> Iterator[dict[str, Batch]]:
+def in_stamp_order(batches: Iterable[dict[str, Batch]], imu: str) -> Iterator[dict[str, Batch]]:
     """Yield batches in the order of stamps from batches in the order of log time, with bounded memory.
 
     A message waits until the recording has been read for another `LOOK_AHEAD` of log time. One that was recorded later
-    than that behind newer stamps comes late here, too.
+    than that behind newer stamps comes late here, too. Where the clock of the topic ``imu`` was set back, what was
+    stamped before comes first.
     """
     held: dict[str, Batch] = {}
     for batch in batches:
         for topic, new in batch.items():
             held[topic] = _joined(held[topic], new) if topic in held else new
+        while imu in held and (steps := steps_back(held[imu].messages["stamp"], begins_earlier=True)):
+            before, held = _cut(held, imu, steps[0])
+            yield _taken(before, np.iinfo(np.int64).max)
         newest = max(int(part.log_time.max()) for part in held.values())
         settled = [part.messages["stamp"][part.log_time <= newest - LOOK_AHEAD] for part in held.values()]
         settled = [stamps for stamps in settled if len(stamps)]
@@ -140,6 +146,28 @@ def in_stamp_order(batches: Iterable[dict[str, Batch]]) -> Iterator[dict[str, Ba
             limit = max(int(stamps.max()) for stamps in settled)
             yield _taken(held, limit)
     yield _taken(held, np.iinfo(np.int64).max)
+
+
+def _cut(held: dict[str, Batch], imu: str, first: int) -> tuple[dict[str, Batch], dict[str, Batch]]:
+    """Return the messages before and after the clock was set back, ``first`` being the first IMU sample after it.
+
+    A measurement that was recorded after it, but is stamped ahead of the IMU of then, still has the old clock.
+    """
+    samples = held[imu]
+    log_time, stamps = samples.log_time[first:], samples.messages["stamp"][first:]
+    before: dict[str, Batch] = {}
+    after: dict[str, Batch] = {}
+    for topic, part in held.items():
+        is_new = part.log_time >= log_time[0]
+        if topic == imu:
+            is_new = np.arange(len(part.log_time)) >= first
+        else:
+            there = stamps[np.clip(np.searchsorted(log_time, part.log_time), 0, len(stamps) - 1)]
+            is_new &= part.messages["stamp"] <= there + AHEAD
+        for chosen, target in ((~is_new, before), (is_new, after)):
+            if chosen.any():
+                target[topic] = Batch(part.log_time[chosen], part.messages[chosen], part.strings)
+    return before, after
 
 
 def _joined(first: Batch, second: Batch) -> Batch:

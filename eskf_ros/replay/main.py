@@ -309,7 +309,18 @@ def _show(summary: dict[str, Any], folder: Path, to_stderr: bool) -> None:
     for name, aid in summary["aids"].items():
         counts = [_rounded(aid[key], "d") for key in counted]
         aids.add_row(name, *counts, _rounded(aid["nis_mean"], ".2f"), _rounded(aid["nis_in_95"], ".1%"))
+    imu = summary["imu"]
+    used = imu["offered"] - sum(count for reason, count in imu.items() if reason != "offered")
+    aids.add_row(
+        "imu", *(str(count) for count in (imu["offered"], used, imu["offered"] - used - imu["late"], imu["late"]))
+    )
     console.print(aids)
+    for line in _rejections(summary):
+        console.print(line, highlight=False, soft_wrap=True)
+    quality = summary["quality"]
+    console.print(
+        f"Usable for navigation: {quality['usable']:.1%} of the time from the first position on", highlight=False
+    )
     if "ranges" in summary:
         console.print(f"Epochs of ranges: {summary['ranges']['epochs']}, withheld: {summary['ranges']['withheld']}")
     if "error" in summary:
@@ -330,6 +341,21 @@ def _show(summary: dict[str, Any], folder: Path, to_stderr: bool) -> None:
             outages.add_row(f"at {outage['start']:g} s", f"{outage['length']:g}", f"{outage['distance']:.0f}", *at_end)
         console.print(outages)
     console.print(f"Results: {folder}", highlight=False, soft_wrap=True)
+
+
+def _rejections(summary: dict[str, Any]) -> list[str]:
+    """Return a line for each input of which something was rejected, with the reasons."""
+    fine = ("fused", "weighed_down", "reset", "outside_history", "waiting")
+    reasons = {
+        name: {why: count for why, count in aid["verdicts"].items() if why not in fine}
+        for name, aid in summary["aids"].items()
+    }
+    reasons["imu"] = {why: count for why, count in summary["imu"].items() if why not in ("offered", "late") and count}
+    return [
+        f"{name} rejected: {', '.join(f'{count} {why}' for why, count in counts.items())}"
+        for name, counts in reasons.items()
+        if counts
+    ]
 
 
 def _table(*headings: str) -> Table:

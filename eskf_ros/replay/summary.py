@@ -2,8 +2,9 @@
 
 Stamps are integer ns, lengths m, times s; an unknown value is null.
 
-- `duration_s`: from the first to the newest IMU stamp; `imu_count`: samples offered; `imu`: counts of what became of
-  them. `restarts`: restarts of the alignment; `position_resets`: how often fixes won over the filter.
+- `duration_s`: from the first to the newest IMU stamp, steps of the clock taken out; `imu_count`: samples offered;
+  `imu`: counts of what became of them. `restarts`: restarts of the alignment; `position_resets`: how often fixes won
+  over the filter.
 - `aids.{name}`: `offered` measurements by their final verdict: `fused` (weighed_down and reset, too), `late`
   (outside_history), `rejected` (all other verdicts but waiting, which is for those newer than the last IMU sample); all
   of them in `verdicts`. `withheld` measurements were not offered (--outage, --mode ins-only); null for parts of epochs
@@ -11,6 +12,7 @@ Stamps are integer ns, lengths m, times s; an unknown value is null.
   tested, the gated ones included.
 - `..._in_95`, `in_95`: share of the values not above the 95 % quantile of chi-square (ideal 0.95; above it the filter
   is cautious).
+- `quality`: share of the rows with a known position that are `usable` for navigation, and by `Quality`.
 - `final`: the state at the newest IMU sample, `position` and `velocity` of base_link in map, `lla` deg deg m, `rpy_deg`
   about the local vertical, yaw 0 = east; biases in IMU axes.
 - `error`: absolute errors at the truth epochs from the first known position on, heading from the first known heading
@@ -32,7 +34,7 @@ from numpy.typing import NDArray
 
 from eskf_ros.filter.integrity.traffic import late_remedy
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.filter.state.enums import STREAM_NAMES, Status, Stream, Verdict
+from eskf_ros.filter.state.enums import IS_USABLE, STREAM_NAMES, Quality, Status, Stream, Verdict
 from eskf_ros.geodesy.map_frame import MapFrame, east_north_up_to_ecef, to_geodetic
 from eskf_ros.inputs.epochs import RangeIntake
 from eskf_ros.inputs.table import Input
@@ -60,6 +62,7 @@ class Summary:
         self._distances = [0.0] * len(outages)
         self._last_position = np.zeros((0, 3))
         self._rows = 0
+        self._qualities = np.zeros(len(Quality), np.int64)
         self._verdicts = np.zeros((len(STREAM_NAMES), len(Verdict)), np.int64)
         self._nis_count = np.zeros(len(STREAM_NAMES), np.int64)
         self._nis_inside = np.zeros(len(STREAM_NAMES), np.int64)
@@ -68,6 +71,7 @@ class Summary:
     def add(self, rows: NDArray[Any], records: NDArray[Any]) -> None:
         """Take ODOMETRY rows (n,) with known positions and increasing stamps, and final RECORD rows (m,)."""
         self._rows += len(rows)
+        self._qualities += np.bincount(rows["quality"], minlength=len(Quality))
         positions = np.concatenate([self._last_position, rows["position_map"]])
         steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
         seconds = self._seconds(rows["stamp"][len(rows) - len(steps) :])
@@ -87,7 +91,10 @@ class Summary:
     def result(self, navigator: Navigator, wall_s: float) -> dict[str, Any]:
         """Return the part of the summary that every replay has."""
         final = navigator.odometry[0]
-        duration = (int(final["stamp"]) - self._feed.first_stamp) * 1e-9 if self._feed.first_stamp is not None else 0.0
+        set_by = sum(step.size for step in navigator.clock_steps)
+        duration = 0.0
+        if self._feed.first_stamp is not None:
+            duration = (int(final["stamp"]) - set_by - self._feed.first_stamp) * 1e-9
         return {
             "duration_s": duration,
             "imu_count": self._feed.imu_count,
@@ -98,8 +105,15 @@ class Summary:
             "realtime_factor": duration / wall_s,
             "datum": None if navigator.datum is None else list(navigator.datum),
             "aids": {STREAM_NAMES[stream]: self._aid(stream) for stream in self._aids()},
+            "quality": self._quality(),
             "final": final_result(final, navigator.datum),
         }
+
+    def _quality(self) -> dict[str, float]:
+        """Return the share of the rows by quality, and of those that are usable."""
+        shares = self._qualities / max(1, self._rows)
+        found = {quality.name.lower(): float(shares[quality]) for quality in Quality if shares[quality] > 0.0}
+        return {"usable": float(shares[list(IS_USABLE)].sum()), **found}
 
     def _aids(self) -> list[Stream]:
         """Return the streams of the inputs in the recording, and of the constraints that were ever active."""
@@ -243,6 +257,7 @@ def final_result(row: NDArray[Any], datum: tuple[float, float, float] | None) ->
     result: dict[str, Any] = {
         "stamp": int(row["stamp"]),
         "status": Status(int(row["status"])).name,
+        "usable": int(row["quality"]) in IS_USABLE,
         "lla": None,
         "position": None,
         "velocity": None,

@@ -102,7 +102,18 @@ class TruthComparison:
         self._waiting = np.concatenate([self._waiting, epochs])
 
     def add_rows(self, rows: NDArray[Any], datum: tuple[float, float, float]) -> None:
-        """Add ODOMETRY rows (n,) with a known position, and compare the truth epochs that they have reached."""
+        """Add ODOMETRY rows (n,) with a known position, and compare the truth epochs that they have reached.
+
+        Where the clock was set back, the rows before and after are no neighbours.
+        """
+        last = rows["stamp"][:1] if self._rows is None else self._rows["stamp"][-1:]
+        cuts = np.flatnonzero(np.diff(np.concatenate([last, rows["stamp"]])) < 0)
+        if len(cuts):
+            for number, part in enumerate(np.split(rows, cuts)):
+                self._rows = None if number else self._rows
+                if len(part):
+                    self.add_rows(part, datum)
+            return
         self._rows = rows if self._rows is None else np.concatenate([self._rows, rows])
         stamps = self._rows["stamp"]
         reached = self._waiting["stamp"] <= stamps[-1]

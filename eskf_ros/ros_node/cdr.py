@@ -44,6 +44,8 @@ class ImuReader:
     """Reads serialised sensor_msgs/Imu; each subscription needs its own: it remembers the frame name."""
 
     def __init__(self) -> None:
+        self.is_uncarried = False
+        """Whether the last message has a second or more of nanoseconds in its stamp."""
         self._set_frame_length(1)
         self._terminated = b""
         self._frame = b""
@@ -68,6 +70,7 @@ class ImuReader:
             if terminated.find(0) != len(terminated) - 1:
                 return None
             self._terminated, self._frame = terminated, terminated[:-1]
+        self.is_uncarried = nanoseconds >= 1_000_000_000
         return seconds * 1_000_000_000 + nanoseconds, values[8:11], values[5:8], self._frame
 
     def _adapt(self, data: bytes) -> bool:

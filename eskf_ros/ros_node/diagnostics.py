@@ -315,6 +315,8 @@ def counters(seen: Snapshot) -> dict[str, object]:
     }
     found.update({f"trouble: {kind}": count for kind, count in seen.trouble.counts.items()})
     found.update({f"imu {name}": count for name, count in seen.navigator.imu_counts.items()})
+    found.update({f"note {number}": note for number, note in enumerate(seen.navigator.notes, 1)})
+    found["clock steps"] = len(seen.navigator.clock_steps)
     return found
 
 

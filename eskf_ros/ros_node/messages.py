@@ -11,7 +11,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from sensor_msgs.msg import NavSatFix, NavSatStatus
 
-from eskf_ros.filter.state.enums import STREAM_NAMES, Stream, Verdict
+from eskf_ros.filter.state.enums import IS_USABLE, QUALITY_REASONS, STREAM_NAMES, Quality, Status, Stream, Verdict
 from eskf_ros.filter.state.time import SECOND
 from eskf_ros.filter.tight.signal import name_of
 from eskf_ros.geodesy.map_frame import MapFrame
@@ -19,6 +19,9 @@ from eskf_ros.gnss.point_solution import PointSolution, SolutionStatus
 
 GOOD_VERDICTS = (Verdict.FUSED, Verdict.WEIGHED_DOWN, Verdict.DUPLICATE, Verdict.DISABLED)
 """Verdicts that are no fault of the measurement."""
+
+IMU_SILENCE = 1.0
+"""s; after this time without an IMU message nothing is published that a robot could navigate by."""
 
 SIGNALS = (Stream.PSEUDORANGE, Stream.RANGE_RATE)
 """Streams whose sources are signals of satellites."""
@@ -72,6 +75,36 @@ def solution_message(solution: PointSolution, stamp: int, frame: str) -> NavSatF
     message.position_covariance = np.ascontiguousarray(solution.covariance_enu, np.float64).ravel()
     message.position_covariance_type = NavSatFix.COVARIANCE_TYPE_KNOWN
     return message
+
+
+def quality_message(row: np.void, node: str, silence: float) -> DiagnosticStatus:
+    """Return whether an ODOMETRY row may be used for navigation: OK, WARN (usable, dead reckoning) or ERROR (not).
+
+    ``silence``: time since the last IMU message (s), NaN before the first one.
+    """
+    quality = Quality(int(row["quality"]))
+    reason = QUALITY_REASONS[quality]
+    is_usable = quality in IS_USABLE
+    if not silence <= IMU_SILENCE:
+        is_usable, reason = False, "no IMU message has come" + (f" for {silence:.1f} s" if silence > 0.0 else "")
+    level = DiagnosticStatus.OK if quality == Quality.GOOD else DiagnosticStatus.WARN
+    covariance = row["pose_covariance"]
+    return DiagnosticStatus(
+        level=level if is_usable else DiagnosticStatus.ERROR,
+        name=f"{node}: quality",
+        hardware_id="eskf_ros",
+        message=reason,
+        values=key_values(
+            {
+                "usable": "yes" if is_usable else "no",
+                "quality": quality.name,
+                "state": Status(int(row["status"])).name,
+                "stamp": f"{int(row['stamp']) // SECOND}.{int(row['stamp']) % SECOND:09d}",
+                "horizontal std (m)": f"{math.sqrt(max(0.0, covariance[0, 0] + covariance[1, 1])):.3f}",
+                "heading std (deg)": f"{math.degrees(math.sqrt(max(0.0, covariance[5, 5]))):.2f}",
+            }
+        ),
+    )
 
 
 def record_statuses(records: np.ndarray, stamp: Time) -> DiagnosticArray:

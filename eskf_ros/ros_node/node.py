@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
@@ -22,6 +22,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
 
+from eskf_ros.bags.messages import UNCARRIED
 from eskf_ros.compiled import sentence_on_compiling, while_compiling
 from eskf_ros.filter.navigator import ORIENTATION_SHARE, Navigator
 from eskf_ros.filter.state.enums import STREAM_NAMES, Status, Stream, Verdict
@@ -39,7 +40,7 @@ from eskf_ros.ros_node.diagnostics import Snapshot, status_report
 from eskf_ros.ros_node.error_counter import Trouble
 from eskf_ros.ros_node.extrinsics import IMU, Extrinsics, place_of
 from eskf_ros.ros_node.memory import WarmStart
-from eskf_ros.ros_node.messages import bias_message, fix_message, record_statuses, solution_message
+from eskf_ros.ros_node.messages import bias_message, fix_message, quality_message, record_statuses, solution_message
 from eskf_ros.ros_node.publishers import OUTPUT_QOS, OVERRIDING, Outputs
 from eskf_ros.ros_node.set_pose import set_pose
 from eskf_ros.ros_node.subscriptions import AidInput, open_inputs
@@ -75,13 +76,16 @@ class EskfNode(Node):
         is_tight = self.parameters.mode == "tight"
         self.position_stream = Stream.PSEUDORANGE if is_tight else Stream.GNSS_POSITION
         self.latest_positions: dict[Verdict, int] = {}
-        self._has_noted = False
+        self._noted: set[str] = set()
         self.callbacks, self.callback_time, self.longest_callback = 0, 0.0, 0.0
         self._restarts = 0
         self.extrinsics = Extrinsics(self.parameters)
         self._frames_met: set[tuple[str, str]] = set()
         self._imu_frames_met: set[bytes] = set()
         self._imu_frame = ""
+        self._first_stamp = 0
+        self._last_quality = -1
+        self._clock_steps = 0
         self._is_judging = False
         self._is_simulated = bool(self.get_parameter("use_sim_time").value)
         self._reports = 0
@@ -93,12 +97,14 @@ class EskfNode(Node):
         self._filtered = self._publisher(NavSatFix, "gps/filtered")
         self._bias = self._publisher(TwistWithCovarianceStamped, "imu/bias")
         self._aids = self._publisher(DiagnosticArray, "eskf/aids")
+        self._quality = self._publisher(DiagnosticStatus, "eskf/quality")
         self._diagnostics = self._publisher(DiagnosticArray, "/diagnostics")
         self.output_publishers: tuple[Any, ...] = (
             *self.outputs.publishers,
             self._filtered,
             self._bias,
             self._aids,
+            self._quality,
             self._diagnostics,
         )
 
@@ -209,6 +215,7 @@ class EskfNode(Node):
         self.get_logger().warn(f"{why}: the estimator starts again")
         self.navigator.reset()
         self.resets += 1
+        self._first_stamp = 0
         for source in self.aid_inputs:
             for monitor in source.monitors:
                 monitor.restart()
@@ -220,8 +227,10 @@ class EskfNode(Node):
             sample = imu_from_message(deserialize_message(data, Imu))
         stamp, specific_force, angular_rate, frame = sample
         judgement = self.imu_monitor.note(stamp, self.now())
-        if judgement == Stamp.STARTED_AGAIN:
-            self._reset(f"the stamps of {self.imu_monitor.topic} went back")
+        if self._imu_reader.is_uncarried:
+            self.trouble.note(f"{self.imu_monitor.topic}: messages {UNCARRIED}")
+        if judgement == Stamp.STARTED_AGAIN and (self._is_simulated or self._is_at_start(stamp)):
+            self._reset(f"the stamps of {self.imu_monitor.topic} went back to their beginning")
         elif judgement == Stamp.WENT_AHEAD:
             self.get_logger().warn(f"the stamps of {self.imu_monitor.topic} went ahead of this computer's clock")
         if frame not in self._imu_frames_met:
@@ -229,13 +238,20 @@ class EskfNode(Node):
             self._meet_frame(self._imu_frames_met, frame, IMU, self._imu_frame)
         if judgement == Stamp.ZERO:
             return
+        self._first_stamp = self._first_stamp or stamp
         if self._warm_start.is_waiting:
             self._warm_start.offer(self.navigator, stamp)
         if self.parameters.alignment.imu_orientation != "unused" and stamp % SECOND < ORIENTATION_SHARE:
             self._push_orientation(stamp, deserialize_message(data, Imu))
-        rows = self.navigator.push_imu(np.array([stamp]), np.array([specific_force]), np.array([angular_rate]))
+        # A clock that nobody sets; with simulated time, stamps need not pass as it does.
+        arrivals = None if self._is_simulated else np.array([time.monotonic_ns()])
+        rows = self.navigator.push_imu(
+            np.array([stamp]), np.array([specific_force]), np.array([angular_rate]), arrivals
+        )
         for index in range(len(rows)):
             self.outputs.publish(rows, index)
+        if len(rows) and rows[-1]["quality"] != self._last_quality:
+            self._publish_quality()
         if self._is_judging:
             self._tell_verdicts()
         took = time.perf_counter() - started
@@ -243,6 +259,10 @@ class EskfNode(Node):
         self.callback_time += took
         if took > self.longest_callback:
             self.longest_callback = took
+
+    def _is_at_start(self, stamp: int) -> bool:
+        """Say whether an IMU stamp is one of the first second: a recording that loops, not a clock that was set."""
+        return abs(stamp - self._first_stamp) <= SECOND
 
     def _open_ranges(self) -> RangeIntake | None:
         """Prepare the intake of ranges, if ranges are used. Raises ParameterError for unreadable RINEX files."""
@@ -266,6 +286,8 @@ class EskfNode(Node):
     def _on_aid(self, source: AidInput, push: Callable[..., Any], data: bytes) -> None:
         arrival = self.now()
         batch = source.read(data, arrival)
+        if source.is_uncarried:
+            self.trouble.note(f"{source.name}: messages {UNCARRIED}")
         frame = batch.strings[int(batch.messages["frame_id"][0])]
         receiver = source.receiver(frame)
         if (source.kind.name, frame) not in self._frames_met:
@@ -312,18 +334,32 @@ class EskfNode(Node):
             self._bias.publish(bias_message(row, self._imu_frame))
             if row["position_known"] and datum is not None:
                 self._filtered.publish(fix_message(row, datum, self.parameters.frames.base_link))
-        if self.navigator.notes and not self._has_noted:
-            self._has_noted = True
-            self.get_logger().warn("; ".join(self.navigator.notes))
+        for note in self.navigator.notes:
+            # Counts grow; each kind of note is logged once.
+            kind = "".join(character for character in note if not character.isdigit())
+            if kind not in self._noted:
+                self._noted.add(kind)
+                self.get_logger().warn(note)
+        if len(self.navigator.clock_steps) > self._clock_steps:
+            self.get_logger().warn(self.navigator.clock_complaints[0])
+        self._clock_steps = len(self.navigator.clock_steps)
         if self.navigator.restarts > self._restarts:
             self.get_logger().warn("the alignment began again: the IMU was silent, or fix after fix was rejected")
         self._restarts = self.navigator.restarts
+        self._publish_quality()
         self._diagnostics.publish(status_report(self._snapshot(), stamp))
         if self.range_intake is not None:
             self.range_intake.wants_solution = self._solutions.get_subscription_count() > 0
         self.callbacks, self.callback_time, self.longest_callback = 0, 0.0, 0.0
         self._watch_transforms()
         self._reports += 1
+
+    def _publish_quality(self) -> None:
+        """Publish whether the estimate may be used for navigation: once a second, and when it changes."""
+        row = self.navigator.odometry[0]
+        self._last_quality = int(row["quality"])
+        silence = self.imu_monitor.timing(self.now()).silence
+        self._quality.publish(quality_message(row, self.get_fully_qualified_name(), silence))
 
     def _snapshot(self) -> Snapshot:
         """Return what the diagnostics report."""

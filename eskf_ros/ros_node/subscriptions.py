@@ -30,6 +30,7 @@ class AidInput:
         kind: the input.
         name: of the topic, as in the parameters.
         message_class: the chosen one, of rclpy.
+        is_uncarried: whether the last message has a second or more of nanoseconds in its stamp.
         monitors: of the first receiver, and of the second where there is one and it sends on this topic; none if
             stamps are no instants of measurements.
     """
@@ -37,6 +38,7 @@ class AidInput:
     def __init__(self, kind: Input, parameters: Parameters, topic: str) -> None:
         """Prepare the input; `topic`: the resolved name. Raises ParameterError if the message type is not installed."""
         self.kind = kind
+        self.is_uncarried = False
         self._chosen = kind.of_type(getattr(parameters.topics, f"{kind.name}_type", kind.type))
         self.name: str = getattr(parameters.topics, kind.name)
         self._second_frame = parameters.second_gnss.frame_id if kind.by_receiver else ""
@@ -73,6 +75,7 @@ class AidInput:
         # Each message has its own string table: names that never come again must not fill the memory.
         strings = StringTable()
         messages, valid = decode(self._chosen.type, np.frombuffer(data, np.uint8)[None], strings)
+        self.is_uncarried = strings.uncarried > 0
         return Batch(np.array([arrival]), messages, strings.values) if valid is None else None
 
     def receiver(self, frame: str) -> int:

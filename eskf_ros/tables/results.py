@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.filter.state.enums import STREAM_NAMES, Status, Verdict
+from eskf_ros.filter.state.enums import IS_USABLE, STREAM_NAMES, Quality, Status, Verdict
 from eskf_ros.geodesy.map_frame import MapFrame, to_geodetic
 from eskf_ros.replay.summary import CHI_SQUARE_95, counted, named
 
@@ -40,6 +40,8 @@ def trajectory_table(rows: NDArray[Any], datum: tuple[float, float, float] | Non
         {
             "stamp": rows["stamp"],
             "status": names[rows["status"]],
+            "usable": np.isin(rows["quality"], IS_USABLE),
+            "quality": np.array([value.name for value in Quality])[rows["quality"]],
             "position_known": known,
             "heading_known": rows["heading_known"],
             "latitude_deg": np.degrees(geodetic[:, 0]),

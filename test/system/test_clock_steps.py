@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterator
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import eskf_ros
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import Status, Verdict
 from eskf_ros.parameters.mapping import from_mapping

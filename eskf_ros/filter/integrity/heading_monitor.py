@@ -82,18 +82,23 @@ def watch_course(state, aid, heading, settings):
         note_contrast(state.heading_monitor.course_contrast, wrapped(math.atan2(north, east) - heading))
 
 
+@njit
+def has_lasting_difference(sums):
+    """Say whether the angles of such sums are many, alike and far from zero."""
+    cosine, sine, count = sums[0], sums[1], sums[2]
+    if count < LASTING_COUNT or math.hypot(cosine, sine) < ALIKE * count:
+        return False
+    return abs(math.degrees(math.atan2(sine, cosine))) > FAR_OFF_DEG
+
+
 def _lasting_difference(sums: np.ndarray) -> float | None:
     """Return the mean angle (deg) of such sums, or None unless the angles are many, alike and far from zero."""
-    cosine, sine, count = (float(value) for value in sums)
-    if count < LASTING_COUNT or math.hypot(cosine, sine) < ALIKE * count:
-        return None
-    mean = math.degrees(math.atan2(sine, cosine))
-    return mean if abs(mean) > FAR_OFF_DEG else None
+    return math.degrees(math.atan2(sums[1], sums[0])) if has_lasting_difference(sums) else None
 
 
 def is_heading_contradicted(state: np.void) -> bool:
     """Say whether the dual antenna or the magnetometer has a lasting difference from the estimated heading."""
-    return any(_lasting_difference(sums) is not None for sums in state["heading_monitor"]["sensor_contrast"])
+    return any(has_lasting_difference(sums) for sums in state["heading_monitor"]["sensor_contrast"])
 
 
 def heading_complaints(state: np.void) -> list[str]:

@@ -22,6 +22,10 @@ IMU_MONITOR = np.dtype(
         ("fast_windows", "i8"),
         ("biased_windows", "i8"),
         ("biased_rate", "f8", (3,)),
+        ("intervals", "i8"),
+        ("gaps", "i8"),
+        ("gap_sum", "f8"),
+        ("gap_square_sum", "f8"),
     ],
     align=True,
 )
@@ -31,8 +35,15 @@ IMU_MONITOR = np.dtype(
 specific force cannot be gravity, and its last strength (m/s2). ``tilted_windows``, ``tilted_force``: at rest gravity is
 far from the z axis of base_link, and the last mean force (m/s2, base_link). ``fast_windows``: the mean rate is
 impossible. ``biased_windows``, ``biased_rate``: still windows in a row with the same mean rate (rad/s, IMU axes) that
-is too large for a bias.
+is too large for a bias. ``intervals``, ``gaps``, ``gap_sum``, ``gap_square_sum``: intervals between samples, those of
+them that are longer than ``imu.gap`` (but no silence), and the sums of their lengths (s) and squares (s2).
 """
+
+LONGEST_INTERVAL = 5.0
+"""s; after a longer one the alignment restarts: it is a silence, and no interval of a slow IMU."""
+
+MANY_GAPS = 0.1
+"""Share of gaps among the intervals from which on the IMU is too slow for ``imu.gap``, rather than interrupted."""
 
 NO_GRAVITY = 0.5
 """Share of standard gravity below which no strapdown accelerometer in m/s2 reads on average, at rest or in motion."""
@@ -51,6 +62,19 @@ SAME_RATE = 0.1
 
 BIASED_WINDOWS = 3
 """Still windows in a row with the same mean rate that prove a bias: no robot turns that evenly."""
+
+
+@njit
+def watch_interval(state, settings):
+    """Count the interval that the newest sample ended, if it is one, by whether it is a gap."""
+    interval = state.imu.interval
+    if interval > LONGEST_INTERVAL:
+        return
+    state.imu_monitor.intervals += 1
+    if interval > settings.imu_gap:
+        state.imu_monitor.gaps += 1
+        state.imu_monitor.gap_sum += interval
+        state.imu_monitor.gap_square_sum += interval * interval
 
 
 @njit

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from eskf_ros.filter.integrity.heading_monitor import LASTING_COUNT, heading_complaints
-from eskf_ros.filter.integrity.imu_monitor import BIASED_WINDOWS, FASTEST_TURN, GRAVITY_TOLERANCE
+from eskf_ros.filter.integrity.imu_monitor import BIASED_WINDOWS, FASTEST_TURN, GRAVITY_TOLERANCE, MANY_GAPS
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.geodesy.earth import STANDARD_GRAVITY
+
+FEWEST_GAPS = 5
+"""Gaps of the IMU from which on their share is judged."""
 
 LONG_REFUSED = 30.0
 """s; velocities that are rejected for longer than this, while messages come, are reported."""
@@ -30,6 +35,21 @@ def _refused_complaints(state: np.void) -> list[str]:
         if count > LASTING_COUNT and since > LONG_REFUSED > last:
             found.append(f"{count} messages of {stream.name.lower()} in a row contradict the estimate: {causes}")
     return found
+
+
+def _rate_complaints(state: np.void) -> list[str]:
+    """Return a sentence if the IMU is too slow for imu.gap, with the value that would do: no interval is a gap then."""
+    monitor = state["imu_monitor"]
+    intervals, gaps = int(monitor["intervals"]), int(monitor["gaps"])
+    if gaps < FEWEST_GAPS or gaps < MANY_GAPS * intervals:
+        return []
+    mean = float(monitor["gap_sum"]) / gaps
+    spread = math.sqrt(max(0.0, float(monitor["gap_square_sum"]) / gaps - mean * mean))
+    wanted = math.ceil(10.0 * (1.2 * mean + 4.0 * spread)) / 10.0
+    return [
+        f"{gaps} of {intervals} intervals between IMU samples are longer than imu.gap ({mean:.2f} s on average): the "
+        f"IMU is too slow or irregular for it; set imu.gap to {wanted:.1f}, or raise the rate of the IMU"
+    ]
 
 
 def complaints(state: np.void) -> list[str]:
@@ -59,4 +79,4 @@ def complaints(state: np.void) -> list[str]:
         found.append(
             f"the gyro reads more than {FASTEST_TURN:.0f} rad/s for seconds: is it in deg/s? REP-103 wants rad/s"
         )
-    return found + heading_complaints(state) + _refused_complaints(state)
+    return found + _rate_complaints(state) + heading_complaints(state) + _refused_complaints(state)

@@ -1,4 +1,4 @@
-"""Output rows: the state of the IMU turned into pose and twist of base_link, with covariance, and the status."""
+"""Output rows: the state of the IMU turned into pose and twist of base_link, with covariance, status and quality."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.levelling import UNKNOWN_SPEED
 from eskf_ros.filter.inertial.navigation_frame import body_rate, heading_of
-from eskf_ros.filter.state.enums import Status
-from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, VELOCITY
-from eskf_ros.filter.state.time import NEVER
+from eskf_ros.filter.output.status import quality_of, status_of
+from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, GYRO_BIAS, POSITION, VELOCITY
 from eskf_ros.geodesy.rotation import cross, from_matrix, from_rotation_vector, multiply, rotate, rotate_back, to_matrix
 
 ODOMETRY = np.dtype(
     [
         ("stamp", "i8"),
         ("status", "i4"),
+        ("quality", "i4"),
         ("position_known", "?"),
         ("heading_known", "?"),
         ("position_map", "f8", (3,)),
@@ -44,51 +44,6 @@ ODOMETRY = np.dtype(
 attitudes are quaternions (w x y z). Covariances: position and rotation in map axes, velocity and rate in base_link
 axes.
 """
-
-SHORTEST_COAST = 1_000_000_000
-"""ns; least time without an accepted position after which the status is COASTING (usually two of its intervals)."""
-
-LONGEST_WAIT = 3_000_000_000
-"""ns; largest time without an accepted position after which the status is COASTING."""
-
-CONTRADICTIONS = 3
-"""Absolute positions rejected in a row from which on the status is DEGRADED: fewer may be outliers."""
-
-
-@njit
-def status_of(state, settings):
-    """Return the `Status` at the stamp of the state."""
-    if state.imu.stamp == NEVER:
-        return Status.WAITING_IMU
-    if state.level_known == 0:
-        return Status.LEVELLING
-    if not is_sound(state):
-        return Status.FAULT
-    if state.position_known == 0:
-        return Status.WAITING_FIX
-    if state.heading_known == 0:
-        return Status.WAITING_HEADING
-    patience = max(SHORTEST_COAST, min(LONGEST_WAIT, 2 * state.recovery.absolute_interval))
-    if state.stamp - state.recovery.absolute_stamp > patience:
-        return Status.COASTING
-    if state.recovery.rejected_fixes >= CONTRADICTIONS:
-        return Status.DEGRADED
-    if state.covariance[ATTITUDE + 2, ATTITUDE + 2] > settings.good_heading_std**2:
-        return Status.ALIGNING
-    return Status.GOOD
-
-
-@njit
-def is_sound(state):
-    """Say whether position, velocity, attitude and all variances are numbers, and no variance is negative."""
-    total = state.attitude[0] + state.attitude[1] + state.attitude[2] + state.attitude[3]
-    for i in range(3):
-        total += state.position_map[i] + state.velocity_map[i]
-    for i in range(ERROR_SIZE):
-        if not state.covariance[i, i] >= 0.0:
-            return False
-        total += state.covariance[i, i]
-    return math.isfinite(total)
 
 
 @njit
@@ -132,6 +87,7 @@ def write_odometry(state, local, settings, row):
 
     row.stamp = state.stamp
     row.status = status_of(state, settings)
+    row.quality = quality_of(state, row.status, settings)
     row.position_known = state.position_known == 1
     row.heading_known = state.heading_known == 1
     for i in range(4):

@@ -23,6 +23,37 @@ class Status(IntEnum):
     FAULT = 8
 
 
+class Quality(IntEnum):
+    """Whether the estimate may be used for navigation (`IS_USABLE`), and why not (`QUALITY_REASONS`)."""
+
+    GOOD = 0
+    COASTING = 1
+    NOT_ALIGNED = 2
+    FIXES_CONTRADICT = 3
+    HEADING_CONTRADICTED = 4
+    SETTLING = 5
+    COASTED_TOO_LONG = 6
+    TOO_UNCERTAIN = 7
+    FAULT = 8
+
+
+IS_USABLE = (Quality.GOOD, Quality.COASTING)
+"""Qualities with which a robot may go on."""
+
+QUALITY_REASONS = {
+    Quality.GOOD: "aligned, and the sensors agree",
+    Quality.COASTING: "no position has been accepted for a moment; dead reckoning",
+    Quality.NOT_ALIGNED: "the alignment is not complete: see the state",
+    Quality.FIXES_CONTRADICT: "positions come and contradict the estimate",
+    Quality.HEADING_CONTRADICTED: "a heading sensor contradicts the estimated heading for long",
+    Quality.SETTLING: "the position was reset to the fixes less than quality.settle_time ago",
+    Quality.COASTED_TOO_LONG: "no position has been accepted for longer than quality.coast_time",
+    Quality.TOO_UNCERTAIN: "the horizontal standard deviation is above quality.position_std",
+    Quality.FAULT: "the estimate is broken: call the service ~/reset",
+}
+"""What each quality means."""
+
+
 class Phase(IntEnum):
     """Whether the filter uses a stream of measurements at present (see `recovery`).
 
