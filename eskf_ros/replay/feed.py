@@ -33,7 +33,7 @@ class Feed:
     are withheld. `ins_only` withholds all GNSS messages from the moment the state is GOOD.
 
     Attributes:
-        first_stamp: ns, the earliest IMU stamp of the first batch that has IMU samples.
+        first_stamp: ns, the earliest IMU stamp of the first batch that has IMU samples, before a step of the clock.
         imu_count: IMU samples offered.
         withheld: number of messages that were not offered, by input.
     """
@@ -72,7 +72,8 @@ class Feed:
             angular_rate = np.ascontiguousarray(imu.messages["angular_velocity"])
             self.imu_count += len(stamps)
             if self.first_stamp is None and (stamps > 0).any():
-                self.first_stamp = int(stamps[stamps > 0].min())
+                before = stamps[: next(iter(steps_back(stamps, begins_earlier=True)), None)]
+                self.first_stamp = int(before[before > 0].min(initial=stamps[stamps > 0][0]))
         done = 0
 
         def push_imu_until(end: int) -> None:

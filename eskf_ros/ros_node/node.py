@@ -211,6 +211,10 @@ class EskfNode(Node):
         # Reading the node's clock costs more than the filter; without simulated time it is the system clock.
         return int(self.get_clock().now().nanoseconds) if self._is_simulated else time.time_ns()
 
+    def steady(self) -> int:
+        """Time of a clock that nobody sets (ns)."""
+        return time.monotonic_ns()
+
     def _reset(self, why: str) -> None:
         self.get_logger().warn(f"{why}: the estimator starts again")
         self.navigator.reset()
@@ -243,8 +247,8 @@ class EskfNode(Node):
             self._warm_start.offer(self.navigator, stamp)
         if self.parameters.alignment.imu_orientation != "unused" and stamp % SECOND < ORIENTATION_SHARE:
             self._push_orientation(stamp, deserialize_message(data, Imu))
-        # A clock that nobody sets; with simulated time, stamps need not pass as it does.
-        arrivals = None if self._is_simulated else np.array([time.monotonic_ns()])
+        # With simulated time, stamps need not pass as a steady clock does.
+        arrivals = None if self._is_simulated else np.array([self.steady()])
         rows = self.navigator.push_imu(
             np.array([stamp]), np.array([specific_force]), np.array([angular_rate]), arrivals
         )

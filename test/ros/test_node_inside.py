@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -12,7 +13,7 @@ import pytest
 
 from eskf_ros.bags import StringTable, decode, encode
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.filter.state.enums import Status, Stream
+from eskf_ros.filter.state.enums import Quality, Status, Stream
 from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.parameters.ros_yaml import load
 from eskf_ros.ros_node.error_counter import FRESH, KINDS, Trouble
@@ -394,6 +395,72 @@ def test_a_clock_that_is_set_is_told_and_survived(make, drive, start, monkeypatc
     assert any("the alignment began again" in line for line in lines)
     assert inside.values["resets"] == "0"
     assert inside.node.navigator.status == Status.GOOD
+
+
+@needs_ros
+@pytest.mark.parametrize("size", [-60.0, -5.0, -0.5, 5.0])
+def test_a_clock_that_is_set_while_time_goes_on_costs_nothing(make, drive, size):
+    """All stamps jump, arrivals do not: no reset, no restart, and every sample is answered under its own stamp."""
+    inside = make()
+    inside.node.steady = lambda: inside.time
+    begin = drive[0][0] + 20 * SECOND
+
+    def jump(messages: Any) -> None:
+        messages["stamp"] += round(size * SECOND)
+
+    inside.play([message for message in drive if message[0] < begin])
+    before = len(inside.published["/odometry/global"])
+    inside.play([(t, topic, changed(topic, data, jump)) for t, topic, data in drive if t >= begin])
+    message = inside.report().message
+    word = "forward" if size > 0.0 else "back"
+    assert f"the clock of the IMU's stamps was set {word} by {abs(size):.1f} s" in message
+    assert inside.values["resets"] == inside.values["restarts"] == inside.values["position resets"] == "0"
+    assert inside.values["imu late"] == inside.values["imu bad_stamp"] == "0"
+    count = sum(topic == "imu/data" and t >= begin for t, topic, _ in drive)
+    assert len(inside.published["/odometry/global"]) - before == count
+    assert inside.node.navigator.quality == Quality.GOOD
+
+
+@needs_ros
+def test_nanoseconds_of_a_second_and_more_are_named(make, start):
+    """A driver that adds to the nanoseconds and forgets to carry: the sum is right, and it is told."""
+
+    def uncarried(data: bytes) -> bytes:
+        seconds, nanoseconds = struct.unpack_from("<iI", data, 4)
+        return data[:4] + struct.pack("<iI", seconds - 1, nanoseconds + SECOND) + data[12:]
+
+    inside, plain = make(), make()
+    inside.play([(t, topic, uncarried(data)) for t, topic, data in start])
+    plain.play(start)
+    message = inside.report().message
+    for topic in ("/imu/data", "gps/fix", "gps/vel"):
+        assert f"{topic}: messages have a second or more in header.stamp.nanosec" in message
+    assert "nanosec" not in plain.report().message
+    assert inside.node.navigator.odometry.tobytes() == plain.node.navigator.odometry.tobytes()
+
+
+@needs_ros
+def test_quality_says_whether_to_go_on(make, drive):
+    """Once a second, and at once when it changes: no before the alignment, yes while all agree, no without the IMU."""
+    inside = make()
+    said = inside.published["/eskf/quality"]
+
+    def of(message: Any) -> dict[str, str]:
+        return {pair.key: pair.value for pair in message.values}
+
+    inside.play([message for message in drive if message[0] < drive[0][0] + SECOND])
+    inside.report()
+    assert (said[-1].level, of(said[-1])["usable"], of(said[-1])["quality"]) == (b"\x02", "no", "NOT_ALIGNED")
+    inside.play([message for message in drive if message[0] >= drive[0][0] + SECOND])
+    # Said by itself when it became good, without a report.
+    assert (said[-1].level, of(said[-1])["usable"], of(said[-1])["quality"]) == (b"\x00", "yes", "GOOD")
+    count = len(said)
+    inside.report()
+    assert len(said) == count + 1
+    inside.time += 5 * SECOND
+    inside.report()
+    assert (said[-1].level, of(said[-1])["usable"]) == (b"\x02", "no")
+    assert said[-1].message.startswith("no IMU message has come for 5.")
 
 
 @needs_ros

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import eskf_ros
+from eskf_ros.bags import BagWriter, Batch, open_bag
+from eskf_ros.filter.history.clock_steps import steps_back
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import Status, Verdict
 from eskf_ros.parameters.mapping import from_mapping
+from eskf_ros.parameters.ros_yaml import load
+from eskf_ros.replay.run import Options, replay
 from eskf_ros.simulate.scenario import Recording, simulate
 from eskf_ros.tables.feeding import push_row
 from monte_carlo import messages_of
@@ -139,3 +146,110 @@ def test_stamps_ahead_that_nothing_follows_cost_nothing(recording: Recording) ->
         )
     assert not navigator.clock_steps
     assert (navigator.imu_counts["bad_stamp"], navigator.imu_counts["late"]) == (1, 0)
+
+
+BAG = Path(__file__).resolve().parents[2] / "bags" / "tunnel_drive.mcap"
+CONFIG = BAG.parents[1] / "config" / "tunnel_drive.yaml"
+TYPES = {
+    "imu/data": "sensor_msgs/msg/Imu",
+    "gps/fix": "sensor_msgs/msg/NavSatFix",
+    "gps/vel": "geometry_msgs/msg/TwistWithCovarianceStamped",
+}
+CUT, END = 40.0, 70.0
+"""s from the start of the bundled drive: where the clock is set, and where the recording ends."""
+
+
+@pytest.fixture(scope="module")
+def messages() -> dict[str, Batch]:
+    found: dict[str, list[Batch]] = {topic: [] for topic in TYPES}
+    with open_bag([BAG]) as reader:
+        end = reader.start_time + round(END * SECOND)
+        for batch in reader.batches(TYPES):
+            for topic, part in batch.items():
+                found[topic].append(part)
+    joined = {}
+    for topic, parts in found.items():
+        log_time = np.concatenate([part.log_time for part in parts])
+        kept = log_time < end
+        content = np.concatenate([part.messages for part in parts])[kept]
+        joined[topic] = Batch(log_time[kept], content, parts[-1].strings)
+    return joined
+
+
+def set_by(messages: dict[str, Batch], size: float) -> dict[str, Batch]:
+    """All stamps from CUT on moved by ``size`` (s); they were recorded by a clock that nobody set."""
+    begin = messages["imu/data"].messages["stamp"][0] + round(CUT * SECOND)
+    changed = {}
+    for topic, part in messages.items():
+        content = part.messages.copy()
+        content["stamp"] += np.where(content["stamp"] >= begin, round(size * SECOND), 0)
+        changed[topic] = Batch(part.log_time, content, part.strings)
+    return changed
+
+
+@pytest.mark.parametrize("order", ["log", "stamp"])
+@pytest.mark.parametrize("size", [-60.0, -5.0, -0.5, 5.0])
+def test_the_replay_carries_on(messages: dict[str, Batch], tmp_path: Path, size: float, order: str) -> None:
+    summaries = {}
+    for name, given in (("plain", 0.0), ("set", size)):
+        bag = tmp_path / f"{name}.mcap"
+        with BagWriter(bag) as writer:
+            for topic, part in set_by(messages, given).items():
+                writer.write(writer.add_topic(topic, TYPES[topic]), part.log_time, part.messages, part.strings)
+        summaries[name] = replay(bag, load(CONFIG), Options(folder=tmp_path / name, order=order))
+    plain, stepped = summaries["plain"], summaries["set"]
+    assert any(
+        f"was set {'back' if size < 0 else 'forward'} by {abs(size):.1f} s" in text for text in stepped["warnings"]
+    )
+    assert not [text for text in plain["warnings"] if "was set" in text]
+    assert stepped["restarts"] == stepped["position_resets"] == 0
+    assert stepped["imu"]["late"] == stepped["imu"]["bad_stamp"] == 0
+    assert stepped["duration_s"] == pytest.approx(plain["duration_s"], abs=0.1)
+    assert stepped["aids"]["gnss_position"]["fused"] >= plain["aids"]["gnss_position"]["fused"] - 3
+    assert stepped["final"]["position"] == pytest.approx(plain["final"]["position"], abs=0.1)
+    assert stepped["final"]["status"] == "GOOD"
+
+
+@pytest.mark.parametrize("size", [-20.0, -5.0, -0.5])
+def test_tables_in_memory_carry_on(messages: dict[str, Batch], size: float) -> None:
+    """Rows in the order in which they came: sorted by stamp, old and new ones would be mixed."""
+
+    def result(given: float) -> eskf_ros.Result:
+        parts = {topic: part.messages for topic, part in set_by(messages, given).items()}
+        imu, fix, velocity = parts["imu/data"], parts["gps/fix"], parts["gps/vel"]
+        return eskf_ros.run(
+            {
+                "stamp": imu["stamp"],
+                "specific_force": imu["linear_acceleration"],
+                "angular_rate": imu["angular_velocity"],
+            },
+            {
+                "stamp": fix["stamp"],
+                "latitude_deg": fix["latitude"],
+                "longitude_deg": fix["longitude"],
+                "altitude": fix["altitude"],
+                "covariance": fix["position_covariance"],
+            },
+            {
+                "stamp": velocity["stamp"],
+                "velocity": velocity["linear_velocity"],
+                "covariance": velocity["twist_covariance"].reshape(-1, 6, 6)[:, :3, :3],
+            },
+            parameters=CONFIG,
+        )
+
+    plain, stepped = result(0.0), result(size)
+    assert any(f"was set back by {-size:.1f} s" in text for text in stepped.warnings)
+    assert len(stepped.odometry) == len(plain.odometry)
+    assert stepped.summary["restarts"] == stepped.summary["position_resets"] == 0
+    assert stepped.summary["aids"]["gnss_position"]["fused"] >= plain.summary["aids"]["gnss_position"]["fused"] - 3
+    assert stepped.summary["final"]["position"] == pytest.approx(plain.summary["final"]["position"], abs=0.1)
+
+
+def test_blocks_of_a_table_in_any_order_are_no_step(messages: dict[str, Batch]) -> None:
+    stamps = messages["imu/data"].messages["stamp"]
+    third = len(stamps) // 3
+    assert steps_back(np.concatenate([stamps[third:], stamps[:third]]), begins_earlier=False) == []
+    assert steps_back(np.concatenate([stamps[:third], stamps[2 * third :], stamps[third : 2 * third]]), False) == []
+    rng = np.random.default_rng(0)
+    assert steps_back(rng.permutation(stamps), begins_earlier=False) == []
