@@ -236,7 +236,9 @@ def test_no_recording_named(command: Command) -> None:
 
 def test_every_mistake_in_the_config_is_named_in_one_line(command: Command, tmp_path: Path) -> None:
     config = tmp_path / "config.yaml"
-    config.write_text("/**:\n  ros__parameters:\n    gnss:\n      leverarm: [0.0, 0.0, 0.0]\n      time_offset: 9.9e7\n")
+    config.write_text(
+        "/**:\n  ros__parameters:\n    gnss:\n      leverarm: [0.0, 0.0, 0.0]\n      time_offset: 9.9e7\n"
+    )
     error = command.fails(BAG, "--config", config)
     assert "gnss.leverarm" in error
     assert "gnss.lever_arm" in error
