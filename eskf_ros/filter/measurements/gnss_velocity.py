@@ -37,7 +37,7 @@ NOTABLE_SCATTER = 2.0
 
 @njit
 def noise_factor(state, source):
-    """Return the factor on the covariances of a receiver's velocities that their scatter demands (see `integrity.scatter`)."""
+    """Return the factor on the covariances of velocities that their scatter demands (see `integrity.scatter`)."""
     ratio = state.scatter.velocity[source]
     return ratio if ratio > NOTABLE_SCATTER else 1.0
 

@@ -96,7 +96,7 @@ def project(state, size, work):
 
 @njit
 def invert_positive(matrix, size):
-    """Invert a symmetric positive definite matrix in place (Gauss-Jordan); return its determinant, or 0 if it is none."""
+    """Invert a symmetric positive definite matrix in place (Gauss-Jordan); return its determinant, 0 if it is none."""
     determinant = 1.0
     for k in range(size):
         pivot = matrix[k, k]
