@@ -77,6 +77,7 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
     )
     settings["imu_noise"] = np.square(told)
     settings["humble_noise"] = np.square(np.maximum(HUMBLE_NOISE, np.multiply(told, (4.0, 4.0, 1.0, 1.0))))
+    settings["has_humble_lane"] = 1
     settings["imu_gap"] = imu.gap
     settings["gap_accel_std"] = imu.gap_accel_std
     settings["gap_gyro_std"] = imu.gap_gyro_std

@@ -129,7 +129,7 @@ def kind_of(stream):
 def start(states, settings):
     """Start the humble lane from the filter, where the heading is known; start it anew where it has lost its own."""
     state, humble = states[FILTER], states[HUMBLE]
-    if state.heading_known == 0 or state.position_known == 0:
+    if state.heading_known == 0 or state.position_known == 0 or settings.has_humble_lane == 0:
         humble.heading_known = 0
         return
     if is_running(states) and humble.covariance[ATTITUDE + 2, ATTITUDE + 2] < LOST_HEADING_STD**2:

@@ -112,6 +112,7 @@ def learn_faults(state, aid, size, gate, work, settings):
         state.installation.stamp = NEVER
         state.installation.information.fill(0.0)
         state.installation.evidence.fill(0.0)
+        state.installation.found.fill(0.0)
         return
     if state.installation.stamp == NEVER:
         state.installation.absorbed.fill(0.0)

@@ -113,7 +113,7 @@ def fuse_receiver(states, aid, gate, settings, work):
         note_reset(state)
     if aid.verdict in (Verdict.RESET, Verdict.TAKEOVER):
         forget_corrections(state)
-        forget_spread(state)
+        forget_spread(state, humble, settings)
     note(state, aid.stream, aid.source, aid.verdict)
 
 

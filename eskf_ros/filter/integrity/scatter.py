@@ -94,10 +94,16 @@ def forget_scatter(state, source):
 
 
 @njit
-def forget_spread(state):
-    """Forget how far fixes were from a path that was wrong."""
+def forget_spread(state, lane, settings):
+    """Forget how far fixes were from a path that was wrong, and the lasting errors that were concluded from it."""
     for source in range(SOURCES):
         state.scatter.spread[source] = 1.0
+        calm = 1.0 - state.scatter.change[source] if state.scatter.change[source] < NOTABLE_CALM else 0.0
+        if state.scatter.lasting[source] > STEADY * calm:
+            state.scatter.lasting[source] = calm
+            if settings.position_error_at < state.error_size:
+                reset_augmented(state, settings.position_error_at, 3, settings)
+                reset_augmented(lane, settings.position_error_at, 3, settings)
 
 
 @njit
