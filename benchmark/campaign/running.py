@@ -75,6 +75,7 @@ class Trace:
 def without_gates(navigator: Navigator) -> None:
     """Let a filter believe everything: its innovation gates are open, so it never resets a position nor restarts."""
     navigator._settings["gate"][:] = 1e300
+    navigator._settings["has_humble_lane"] = 0
 
 
 CARS = ("drive", "hour_drive", "tunnel_drive", "stand", "straight", "creep", "train")

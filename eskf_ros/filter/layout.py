@@ -184,6 +184,8 @@ WORK = np.dtype(
         ("noise", "f8", (3, 3)),
         ("effect", "f8", (3, FAULTS)),
         ("fault_covariance", "f8", (FAULTS, FAULTS)),
+        ("solution", "f8", (3,)),
+        ("solution_covariance", "f8", (3, 3)),
         ("shared", "f8", (3, ERROR_CAPACITY)),
         ("projected", "f8", (3, ERROR_CAPACITY)),
         ("innovation_covariance", "f8", (3, 3)),
@@ -216,6 +218,7 @@ WORK = np.dtype(
 - ``projected`` ... ``correction``: intermediate results of the update.
 - ``effect``, ``fault_covariance``: derivative of the measurement by the faults of its receiver, and the covariance of
   these (`installation_monitor`).
+- ``solution``, ``solution_covariance``: position or velocity (map) of the antenna from the ranges of one epoch.
 - ``signal_*`` ... ``step``: the signals of one epoch and their least squares.
 """
 

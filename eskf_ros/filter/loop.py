@@ -120,7 +120,7 @@ def fuse_next(states, aids, count, settings, work):
         fuse(states, aids, i, settings, work)
         return i + 1
     end = end_of_epoch(aids, i, count)
-    fuse_ranges(state, aids, i, end, settings, work)
+    fuse_ranges(states, aids, i, end, settings, work)
     return end
 
 

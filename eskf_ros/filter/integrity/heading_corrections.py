@@ -44,7 +44,7 @@ def forget_corrections(state):
 
 
 @njit
-def are_one_sided(state, before, correction):
+def weigh_correction(state, before, correction):
     """Add a correction (rad) of the heading, whose variance was ``before`` (rad2); say whether they go one way."""
     c = state.corrections
     if c.since == NEVER or state.stamp - c.since > WINDOW:

@@ -24,6 +24,7 @@ import numpy as np
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import heading_of
 from eskf_ros.filter.measurements import gnss_position, gnss_velocity
+from eskf_ros.filter.measurements.jacobians import clear
 from eskf_ros.filter.measurements.kalman_update import apply, judge
 from eskf_ros.filter.state.augmented_states import reset_augmented
 from eskf_ros.filter.state.enums import Stream
@@ -118,11 +119,21 @@ OPENED_GYRO_BIAS_STD = 0.01
 @njit
 def kind_of(stream):
     """Return 0 for positions, 1 for velocities of GNSS, -1 for all else: the humble lane does not hear it."""
-    if stream == Stream.GNSS_POSITION:
+    if stream in (Stream.GNSS_POSITION, Stream.PSEUDORANGE):
         return 0
-    if stream == Stream.GNSS_VELOCITY:
+    if stream in (Stream.GNSS_VELOCITY, Stream.RANGE_RATE):
         return 1
     return -1
+
+
+@njit
+def other_stream(stream):
+    """Return the stream of the other kind of the same receiver: velocities for positions, positions for velocities."""
+    if stream == Stream.GNSS_POSITION:
+        return Stream.GNSS_VELOCITY.value
+    if stream == Stream.GNSS_VELOCITY:
+        return Stream.GNSS_POSITION.value
+    return Stream.RANGE_RATE.value if stream == Stream.PSEUDORANGE else Stream.PSEUDORANGE.value
 
 
 @njit
@@ -143,10 +154,24 @@ def start(states, settings):
 
 @njit
 def linearize(lane, aid, settings, work):
-    """Write innovation, Jacobian and noise of a position or velocity of GNSS in a lane to ``work``."""
+    """Write innovation, Jacobian and noise of a position or velocity of GNSS in a lane to ``work``.
+
+    Of an epoch of ranges it is the solution by least squares in ``work.solution`` (`tight.epoch`).
+    """
     if aid.stream == Stream.GNSS_POSITION:
         return gnss_position.linearize(lane, aid.payload, aid.source, settings, work)
-    return gnss_velocity.linearize(lane, aid.payload, aid.source, settings, work)
+    if aid.stream == Stream.GNSS_VELOCITY:
+        return gnss_velocity.linearize(lane, aid.payload, aid.source, settings, work)
+    clear(work)
+    measured = (work.solution[0], work.solution[1], work.solution[2])
+    for i in range(3):
+        for j in range(3):
+            work.noise[i, j] = work.solution_covariance[i, j]
+    if aid.stream == Stream.PSEUDORANGE:
+        gnss_position.linearize_antenna(lane, measured, 0, settings, work)
+    else:
+        gnss_velocity.linearize_antenna(lane, measured, 0, settings, work)
+    return 3
 
 
 @njit
@@ -159,7 +184,7 @@ def hear(states, aid, gate, settings, work):
     state, humble = states[FILTER], states[HUMBLE]
     kind, source = kind_of(aid.stream), aid.source
     size = linearize(humble, aid, settings, work)
-    if kind == 0 and reset_jumped_error(states, settings, work):
+    if aid.stream == Stream.GNSS_POSITION and reset_jumped_error(states, settings, work):
         linearize(humble, aid, settings, work)
     nis, determinant = judge(humble, size, work)
     believed = False
@@ -172,7 +197,7 @@ def hear(states, aid, gate, settings, work):
         if not note_jump(state, aid, kind, work):
             return True, False, nis, 0.0
         linearize(humble, aid, settings, work)
-        reset_to_message(state, humble, kind, source, work)
+        reset_to_message(state, humble, aid, work)
         size = linearize(humble, aid, settings, work)
         nis, determinant = judge(humble, size, work)
         believed = True
@@ -233,7 +258,7 @@ def note_jump(state, aid, kind, work):
     same receiver agree with the IMU.
     """
     trust, source = state.trust, aid.source
-    is_backed = is_other_agreeing(state, kind, source)
+    is_backed = is_other_agreeing(state, aid.stream, source)
     dt = (aid.stamp - trust.refused_stamp[kind, source]) * 1e-9
     passed = (aid.stamp - trust.refused_since[kind, source]) * 1e-9
     rate = OPENED_VELOCITY_STD if kind == 0 else OPENED_ACCELERATION_STD
@@ -260,27 +285,21 @@ def note_jump(state, aid, kind, work):
         square += work.innovation[i] ** 2
     trust.jump[kind, source] = max(trust.jump[kind, source], math.sqrt(square))
     lasted = aid.stamp - trust.refused_since[kind, source]
-    is_apart = stays > AGREEMENT_GATE or is_other_refused(state, kind, source)
+    is_apart = stays > AGREEMENT_GATE or is_other_refused(state, aid.stream, source)
     patience = SHORT_PATIENCE if is_apart else patience_for(state, aid.stream, source)
     return trust.refused[kind, source] >= FEWEST and lasted >= patience
 
 
 @njit
-def other_stream(kind):
-    """Return the stream of the other kind of message: velocities for positions (0), positions for velocities."""
-    return Stream.GNSS_VELOCITY.value if kind == 0 else Stream.GNSS_POSITION.value
-
-
-@njit
-def is_other_refused(state, kind, source):
+def is_other_refused(state, stream, source):
     """Say whether the other kind of message of a receiver contradicts the humble lane, too: then the IMU is wrong."""
-    return is_live(state, other_stream(kind), source) and state.trust.refused[1 - kind, source] > 0
+    return is_live(state, other_stream(stream), source) and state.trust.refused[1 - kind_of(stream), source] > 0
 
 
 @njit
-def is_other_agreeing(state, kind, source):
+def is_other_agreeing(state, stream, source):
     """Say whether the other kind of message of a receiver comes and agrees with the humble lane."""
-    return is_live(state, other_stream(kind), source) and state.trust.refused[1 - kind, source] == 0
+    return is_live(state, other_stream(stream), source) and state.trust.refused[1 - kind_of(stream), source] == 0
 
 
 @njit
@@ -294,13 +313,14 @@ def patience_for(state, stream, source):
 
 
 @njit
-def reset_to_message(state, lane, kind, source, work):
+def reset_to_message(state, lane, aid, work):
     """Open what a message contradicts, which is believed now; ``work`` holds its innovation and noise.
 
     A position alone moves the position. A velocity moves the velocity and opens the attitude and the biases, which
     have led it astray; so does a position without a velocity beside it.
     """
-    is_inertial = kind == 1 or not is_other_agreeing(state, kind, source)
+    kind = kind_of(aid.stream)
+    is_inertial = kind == 1 or not is_other_agreeing(state, aid.stream, aid.source)
     block = POSITION if kind == 0 else VELOCITY
     reset_block(lane, block)
     for i in range(3):
@@ -331,20 +351,17 @@ def reset_block(lane, block):
 
 
 @njit
-def compare(states, aid, drifts, nis, log_determinant, humble_nis, humble_log_determinant, settings):
-    """Compare how well the lanes predicted a message; let the humble lane take over where the filter is wrong.
+def weigh_evidence(states, aid, nis, log_determinant, humble_nis, humble_log_determinant, settings):
+    """Compare how well the lanes predicted a message; say whether the filter has been worse for too long.
 
-    ``drifts``: its heading has to be corrected to one side all the time. Returns whether it took over.
+    Both innovations with their covariances: NIS and logarithm of the determinant.
     """
     state = states[FILTER]
-    narrow_noise(state)
-    if aid.stream == Stream.GNSS_VELOCITY or not is_live(state, Stream.GNSS_VELOCITY.value, aid.source):
+    update_doubt(state)
+    if kind_of(aid.stream) == 1 or not is_live(state, other_stream(aid.stream), aid.source):
         ratio = min(nis, LARGEST_NIS) + log_determinant - min(humble_nis, LARGEST_NIS) - humble_log_determinant
         state.trust.evidence = max(0.0, state.trust.evidence + 0.5 * ratio)
-    if state.trust.evidence < EVIDENCE and not drifts and not is_heading_apart(states, settings):
-        return False
-    reset_to_humble_lane(states)
-    return True
+    return state.trust.evidence >= EVIDENCE or is_heading_apart(states, settings)
 
 
 @njit
@@ -357,7 +374,7 @@ def is_heading_apart(states, settings):
 
 
 @njit
-def narrow_noise(state):
+def update_doubt(state):
     """Let the doubt about the IMU fade from 1 to 0 over ``doubt_time`` after a takeover."""
     if state.doubt == 0.0:
         return

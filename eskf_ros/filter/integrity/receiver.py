@@ -13,10 +13,10 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.history.records import XX, YY
-from eskf_ros.filter.integrity.heading_corrections import HEADING, are_one_sided, forget_corrections
+from eskf_ros.filter.integrity.heading_corrections import HEADING, weigh_correction, forget_corrections
 from eskf_ros.filter.integrity.humble_lane import (
-    compare,
     hear,
+    weigh_evidence,
     kind_of,
     linearize,
     note_jump,
@@ -98,15 +98,17 @@ def fuse_receiver(states, aid, gate, settings, work):
         update_weighed_down(state, size, aid.nis / gate, work)
         aid.verdict = Verdict.WEIGHED_DOWN
     elif note_jump(state, aid, kind_of(aid.stream), work):
-        reset_to_message(state, state, kind_of(aid.stream), aid.source, work)
+        reset_to_message(state, state, aid, work)
         linearize(state, aid, settings, work)
         update(state, size, math.inf, work)
         believed = True
     else:
         aid.verdict = Verdict.GATE
     if heard and not jumps and not believed:
-        drifts = are_one_sided(state, heading_variance, work.correction[HEADING])
-        if compare(states, aid, drifts, aid.nis, math.log(determinant), humble_nis, humble_log, settings):
+        drifts = weigh_correction(state, heading_variance, work.correction[HEADING])
+        worse = weigh_evidence(states, aid, aid.nis, math.log(determinant), humble_nis, humble_log, settings)
+        if worse or drifts:
+            reset_to_humble_lane(states)
             aid.verdict = Verdict.TAKEOVER
     if believed:
         aid.verdict = Verdict.RESET

@@ -86,7 +86,7 @@ def split_noise(state, source, settings, work):
         for i in range(SIZE):
             std = math.sqrt(lasting * work.noise[i, i])
             work.jacobian[i, place + i] = std
-            work.innovation[i] -= std * state.optional[place - ERROR_SIZE + i]
+            work.innovation[i] = -std * state.optional[place - ERROR_SIZE + i]
     for i in range(SIZE):
         for j in range(SIZE):
             work.noise[i, j] *= white
@@ -96,21 +96,29 @@ def split_noise(state, source, settings, work):
 def linearize(state, payload, source, settings, work):
     """Write innovation, Jacobian and noise of one fix to ``work``; return the number of scalars."""
     clear(work)
-    measured = position_of_fix(state, payload)
-    predicted = predict(state, source, settings)
-    for i in range(3):
-        work.innovation[i] = measured[i] - predicted[i]
-    set_identity(work.jacobian, POSITION)
     set_east_north_up_covariance(work.noise, state, east_north_up_to_ecef(payload[0], payload[1]), payload, 3)
     split_noise(state, source, settings, work)
+    linearize_antenna(state, position_of_fix(state, payload), source, settings, work)
+    return SIZE
+
+
+@njit
+def linearize_antenna(state, measured, source, settings, work):
+    """Add innovation and Jacobian of a position (m, map) of the antenna of ``source`` to ``work``.
+
+    Its noise is there, and its lasting error. While the heading is unknown the lever arm points anywhere around the
+    vertical: its horizontal length is an error of the prediction.
+    """
+    predicted = predict(state, source, settings)
+    for i in range(3):
+        work.innovation[i] += measured[i] - predicted[i]
+    set_identity(work.jacobian, POSITION)
     lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[source])
     if state.heading_known == 0:
-        # The lever arm points anywhere around the vertical: its horizontal length is an error of the prediction.
         for i in range(2):
             work.noise[i, i] += lever[0] ** 2 + lever[1] ** 2
     else:
         set_minus_cross(work.jacobian, ATTITUDE, lever)
-    return SIZE
 
 
 def limits(gnss: Any) -> dict[str, Any]:

@@ -60,16 +60,25 @@ def linearize(state, payload, source, settings, work):
     clear(work)
     local_to_ecef = local_east_north_up_to_ecef(state)
     measured = rotate_back(state.frame.map_to_ecef, rotate(local_to_ecef, (payload[0], payload[1], payload[2])))
-    predicted = predict(state, source, settings)
-    for i in range(3):
-        work.innovation[i] = measured[i] - predicted[i]
-    set_identity(work.jacobian, VELOCITY)
     set_east_north_up_covariance(work.noise, state, local_to_ecef, payload, 3)
     factor = noise_factor(state, source)
     for i in range(SIZE):
         for j in range(SIZE):
             work.noise[i, j] *= factor
+    linearize_antenna(state, measured, source, settings, work)
+    return SIZE
 
+
+@njit
+def linearize_antenna(state, measured, source, settings, work):
+    """Add innovation and Jacobian of a velocity (m/s, map) of the antenna of ``source`` to ``work``.
+
+    Its noise is there; the noise of the gyro, which is part of the prediction, is added to it.
+    """
+    predicted = predict(state, source, settings)
+    for i in range(3):
+        work.innovation[i] = measured[i] - predicted[i]
+    set_identity(work.jacobian, VELOCITY)
     rotation = to_matrix(state.attitude)
     arm = settings.lever_arms_body[source]
     lever = rotate(rotation, arm)
@@ -83,7 +92,7 @@ def linearize(state, payload, source, settings, work):
     if state.heading_known == 0:
         for i in range(3):
             work.noise[i, i] += dot(lever_velocity, lever_velocity)
-        return SIZE
+        return
     set_minus_cross(work.jacobian, ATTITUDE, lever_velocity)
     # An attitude error also turns the Earth rate into the body: [lever]x [Earth rate]x theta.
     earth = state.frame.earth_rate_map
@@ -97,7 +106,6 @@ def linearize(state, payload, source, settings, work):
         row = cross((rotation[i][0], rotation[i][1], rotation[i][2]), arm)
         for j in range(3):
             work.jacobian[i, GYRO_BIAS + j] = row[j]
-    return SIZE
 
 
 def read(messages: npt.NDArray[Any]) -> Readings:

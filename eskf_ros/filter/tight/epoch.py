@@ -24,12 +24,16 @@ from eskf_ros.filter.alignment.heading import search_with
 from eskf_ros.filter.alignment.levelling import reset_level_to_moving
 from eskf_ros.filter.history.timeline import open_record
 from eskf_ros.filter.inertial.navigation_frame import body_rate, heading_of
-from eskf_ros.filter.integrity.recovery import note_epoch
+from eskf_ros.filter.integrity.humble_lane import hear, weigh_evidence, reset_to_humble_lane
+from eskf_ros.filter.integrity.humble_lane import linearize as linearize_solution
+from eskf_ros.filter.integrity.humble_lane import start as start_humble_lane
+from eskf_ros.filter.integrity.recovery import note, note_epoch
 from eskf_ros.filter.measurements import mag
-from eskf_ros.filter.measurements.kalman_update import update
+from eskf_ros.filter.measurements.kalman_update import judge, update
 from eskf_ros.filter.output.local_odometry import note_jump
 from eskf_ros.filter.state.enums import Stream, Verdict
 from eskf_ros.filter.state.error_state import POSITION, VELOCITY
+from eskf_ros.filter.state.lanes import FILTER, HUMBLE, is_running
 from eskf_ros.filter.stationarity.detector import weigh_speed
 from eskf_ros.filter.stationarity.static_window import (
     VELOCITY_SIGMAS,
@@ -82,8 +86,9 @@ def end_of_epoch(aids, first, count):
 
 
 @njit_in_caller
-def fuse_ranges(state, aids, first, end, settings, work):
+def fuse_ranges(states, aids, first, end, settings, work):
     """Fuse or refuse the signals ``aids[first:end]`` of one stream and epoch; write the verdict to each record."""
+    state = states[FILTER]
     waiting = False
     for i in range(first, end):
         if open_record(aids, i):
@@ -92,13 +97,14 @@ def fuse_ranges(state, aids, first, end, settings, work):
         return
     position = (state.position_map[0], state.position_map[1], state.position_map[2])
     heading = heading_of(state, settings)
-    offer_epoch(state, aids, first, end, 0 if aids[first].stream == Stream.PSEUDORANGE else 1, settings, work)
+    offer_epoch(states, aids, first, end, 0 if aids[first].stream == Stream.PSEUDORANGE else 1, settings, work)
     note_jump(state, position, heading, settings)
 
 
 @njit_in_caller
-def offer_epoch(state, aids, first, end, which, settings, work):
+def offer_epoch(states, aids, first, end, which, settings, work):
     """Fuse or refuse the pseudoranges (``which`` 0) or range rates (1) of an epoch, start and clock included."""
+    state = states[FILTER]
     if state.level_known == 0:
         note_coarsely(state, aids, first, end, which, settings, work)
     elif state.position_known == 0 and which == 0:
@@ -111,9 +117,11 @@ def offer_epoch(state, aids, first, end, which, settings, work):
     join_offsets(state, aids, first, end, settings)
     gather(state, aids, first, end, settings, work)
     reset_or_jump_clock(state, aids, first, end, which, settings, work)
+    is_wrong = False
     solved = solve_epoch(work) and spread_of(work) < POOREST_STD
     if solved:
         note_solution(state, aids[first].stamp, which, settings, work)
+        is_wrong = hear_solution(states, aids[first], which, settings, work)
     if solved and is_wide(state, which):
         reject_outliers(aids, work)
     else:
@@ -125,9 +133,16 @@ def offer_epoch(state, aids, first, end, which, settings, work):
             if aids[i].verdict in (Verdict.FUSED, Verdict.WEIGHED_DOWN):
                 fused += 1
                 mag.note_field(state, aids[i], FIELD)
-    if which == 0 and fused >= FEWEST_TO_SOLVE:
-        note_epoch(state, Verdict.FUSED.value)
-    elif which == 0 and work.signal_count >= FEWEST_TO_JUDGE and 2 * fused < work.signal_count:
+    if is_wrong:
+        reset_to_humble_lane(states)
+        fused_as = Verdict.TAKEOVER.value
+    else:
+        fused_as = Verdict.FUSED.value
+    if which == 1:
+        note(state, Stream.RANGE_RATE.value, 0, fused_as if fused >= FEWEST_TO_SOLVE else Verdict.GATE.value)
+    elif fused >= FEWEST_TO_SOLVE:
+        note_epoch(state, fused_as)
+    elif work.signal_count >= FEWEST_TO_JUDGE and 2 * fused < work.signal_count:
         note_epoch(state, Verdict.GATE.value)
 
 
@@ -196,6 +211,10 @@ def note_solution(state, stamp, which, settings, work):
         lever = rotate(rotation, cross(body_rate(state, rotation), arm))
         base = state.velocity_map
     measured = (base[0] + lever[0] + step[0], base[1] + lever[1] + step[1], base[2] + lever[2] + step[2])
+    for i in range(3):
+        work.solution[i] = measured[i]
+        for j in range(3):
+            work.solution_covariance[i, j] = work.normal[i, j]
     if which == 0:
         offset = rotate(state.frame.map_to_ecef, measured)
         origin = state.frame.origin_ecef
@@ -213,3 +232,25 @@ def note_solution(state, stamp, which, settings, work):
                 work.noise[i, j] = work.normal[i, j]
         stream = Stream.PSEUDORANGE.value if which == 0 else Stream.RANGE_RATE.value
         search_with(state, 2 * which, measured, lever, settings.gate[stream, 3], settings, work)
+
+
+@njit
+def hear_solution(states, aid, which, settings, work):
+    """Let the humble lane hear the solution of an epoch; return whether it shows that the filter is wrong.
+
+    The filter is judged by the same solution before it fuses the signals. A solution that jumps is left to the tests of
+    the signals.
+    """
+    start_humble_lane(states, settings)
+    if not is_running(states):
+        return False
+    state = states[FILTER]
+    size = linearize_solution(state, aid, settings, work)
+    nis, determinant = judge(state, size, work)
+    gate = settings.gate[aid.stream, 3]
+    jumps, believed, humble_nis, humble_log = hear(states, aid, gate, settings, work)
+    if believed:
+        return True
+    if jumps or states[HUMBLE].heading_known == 0 or determinant == 0.0:
+        return False
+    return weigh_evidence(states, aid, nis, math.log(determinant), humble_nis, humble_log, settings)
