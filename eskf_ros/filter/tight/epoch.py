@@ -24,7 +24,7 @@ from eskf_ros.filter.alignment.heading import search_with
 from eskf_ros.filter.alignment.levelling import reset_level_to_moving
 from eskf_ros.filter.history.timeline import open_record
 from eskf_ros.filter.inertial.navigation_frame import body_rate, heading_of
-from eskf_ros.filter.integrity.humble_lane import hear, weigh_evidence, reset_to_humble_lane
+from eskf_ros.filter.integrity.humble_lane import hear, reset_to_humble_lane, weigh_evidence
 from eskf_ros.filter.integrity.humble_lane import linearize as linearize_solution
 from eskf_ros.filter.integrity.humble_lane import start as start_humble_lane
 from eskf_ros.filter.integrity.recovery import note, note_epoch
