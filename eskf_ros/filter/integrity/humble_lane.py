@@ -197,7 +197,8 @@ def hear(states, aid, gate, settings, work):
         if not note_jump(state, aid, kind, work):
             return True, False, nis, 0.0
         linearize(humble, aid, settings, work)
-        reset_to_message(state, humble, aid, work)
+        is_inertial = kind == 1 or not is_other_agreeing(state, aid.stream, source)
+        reset_to_message(humble, aid, is_inertial, work)
         size = linearize(humble, aid, settings, work)
         nis, determinant = judge(humble, size, work)
         believed = True
@@ -258,7 +259,8 @@ def note_jump(state, aid, kind, work):
     same receiver agree with the IMU.
     """
     trust, source = state.trust, aid.source
-    is_backed = is_other_agreeing(state, aid.stream, source)
+    # Without a heading the velocity comes from the same receiver: nothing backs the IMU.
+    is_backed = state.heading_known == 1 and is_other_agreeing(state, aid.stream, source)
     dt = (aid.stamp - trust.refused_stamp[kind, source]) * 1e-9
     passed = (aid.stamp - trust.refused_since[kind, source]) * 1e-9
     rate = OPENED_VELOCITY_STD if kind == 0 else OPENED_ACCELERATION_STD
@@ -285,7 +287,7 @@ def note_jump(state, aid, kind, work):
         square += work.innovation[i] ** 2
     trust.jump[kind, source] = max(trust.jump[kind, source], math.sqrt(square))
     lasted = aid.stamp - trust.refused_since[kind, source]
-    is_apart = stays > AGREEMENT_GATE or is_other_refused(state, aid.stream, source)
+    is_apart = stays > AGREEMENT_GATE or is_other_refused(state, aid.stream, source) or state.heading_known == 0
     patience = SHORT_PATIENCE if is_apart else patience_for(state, aid.stream, source)
     return trust.refused[kind, source] >= FEWEST and lasted >= patience
 
@@ -313,14 +315,13 @@ def patience_for(state, stream, source):
 
 
 @njit
-def reset_to_message(state, lane, aid, work):
+def reset_to_message(lane, aid, is_inertial, work):
     """Open what a message contradicts, which is believed now; ``work`` holds its innovation and noise.
 
-    A position alone moves the position. A velocity moves the velocity and opens the attitude and the biases, which
-    have led it astray; so does a position without a velocity beside it.
+    A position moves the position, and where the IMU is at fault (``is_inertial``) opens the velocity. A velocity moves
+    the velocity. A fault of the IMU also opens the attitude and the biases.
     """
     kind = kind_of(aid.stream)
-    is_inertial = kind == 1 or not is_other_agreeing(state, aid.stream, aid.source)
     block = POSITION if kind == 0 else VELOCITY
     reset_block(lane, block)
     for i in range(3):
@@ -335,6 +336,8 @@ def reset_to_message(state, lane, aid, work):
         reset_block(lane, VELOCITY)
         for i in range(3):
             lane.covariance[VELOCITY + i, VELOCITY + i] = OPENED_VELOCITY_STD**2
+    if lane.heading_known == 0:
+        return
     for i in range(3):
         std = OPENED_HEADING_STD if i == 2 else OPENED_TILT_STD
         lane.covariance[ATTITUDE + i, ATTITUDE + i] += std**2

@@ -15,6 +15,7 @@ from eskf_ros.compiled import njit
 from eskf_ros.filter.history.records import XX, YY
 from eskf_ros.filter.integrity.heading_corrections import HEADING, forget_corrections, weigh_correction
 from eskf_ros.filter.integrity.humble_lane import (
+    JUMP_GATE,
     hear,
     kind_of,
     linearize,
@@ -94,11 +95,11 @@ def fuse_receiver(states, aid, gate, settings, work):
         aid.verdict = Verdict.FUSED
     elif jumps:
         aid.verdict = Verdict.CONTRADICTED if is_contradicted(state, aid) else Verdict.GATE
-    elif heard:
+    elif heard or aid.nis <= JUMP_GATE:
         update_weighed_down(state, size, aid.nis / gate, work)
         aid.verdict = Verdict.WEIGHED_DOWN
     elif note_jump(state, aid, kind_of(aid.stream), work):
-        reset_to_message(state, state, aid, work)
+        reset_to_message(state, aid, True, work)
         linearize(state, aid, settings, work)
         update(state, size, math.inf, work)
         believed = True

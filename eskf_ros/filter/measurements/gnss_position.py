@@ -86,7 +86,7 @@ def split_noise(state, source, settings, work):
         for i in range(SIZE):
             std = math.sqrt(lasting * work.noise[i, i])
             work.jacobian[i, place + i] = std
-            work.innovation[i] = -std * state.optional[place - ERROR_SIZE + i]
+            work.innovation[i] -= std * state.optional[place - ERROR_SIZE + i]
     for i in range(SIZE):
         for j in range(SIZE):
             work.noise[i, j] *= white
@@ -97,28 +97,31 @@ def linearize(state, payload, source, settings, work):
     """Write innovation, Jacobian and noise of one fix to ``work``; return the number of scalars."""
     clear(work)
     set_east_north_up_covariance(work.noise, state, east_north_up_to_ecef(payload[0], payload[1]), payload, 3)
-    split_noise(state, source, settings, work)
     linearize_antenna(state, position_of_fix(state, payload), source, settings, work)
+    split_noise(state, source, settings, work)
+    if state.heading_known == 0:
+        add_unknown_lever(state, source, settings, work)
     return SIZE
 
 
 @njit
 def linearize_antenna(state, measured, source, settings, work):
-    """Add innovation and Jacobian of a position (m, map) of the antenna of ``source`` to ``work``.
-
-    Its noise is there, and its lasting error. While the heading is unknown the lever arm points anywhere around the
-    vertical: its horizontal length is an error of the prediction.
-    """
+    """Write innovation and Jacobian of a position (m, map) of the antenna of ``source`` to ``work``, which is clear."""
     predicted = predict(state, source, settings)
     for i in range(3):
-        work.innovation[i] += measured[i] - predicted[i]
+        work.innovation[i] = measured[i] - predicted[i]
     set_identity(work.jacobian, POSITION)
-    lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[source])
-    if state.heading_known == 0:
-        for i in range(2):
-            work.noise[i, i] += lever[0] ** 2 + lever[1] ** 2
-    else:
+    if state.heading_known == 1:
+        lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[source])
         set_minus_cross(work.jacobian, ATTITUDE, lever)
+
+
+@njit
+def add_unknown_lever(state, source, settings, work):
+    """Add to the noise that the lever arm points anywhere around the vertical while the heading is unknown."""
+    lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[source])
+    for i in range(2):
+        work.noise[i, i] += lever[0] ** 2 + lever[1] ** 2
 
 
 def limits(gnss: Any) -> dict[str, Any]:
