@@ -124,8 +124,10 @@ def learn_from_velocity(state, source, nis):
 def learn_from_fix(state, lane, source, settings, work):
     """Learn from a fix in the humble ``lane`` how far fixes are from the path, and how they change."""
     used, _ = noise_shares(state, source, settings)
-    # Without velocities that confirm the path, the path may be wrong and not the fixes; so it may be in doubt.
-    if state.doubt == 0.0 and is_live(state, Stream.GNSS_VELOCITY.value, source):
+    # Without velocities that confirm the path, the path may be wrong and not the fixes; so it may in doubt, or when the
+    # last fix is long ago.
+    is_next = state.stamp - state.scatter.last_stamp[source] <= LONGEST_PAIR
+    if is_next and state.doubt == 0.0 and is_live(state, Stream.GNSS_VELOCITY.value, source):
         away = distance_from_path(lane, source, settings, work)
         state.scatter.spread[source] = running_mean(state.scatter.spread[source], used * away, SPREAD_GAIN)
     learn_from_change(state, source, settings, work)
