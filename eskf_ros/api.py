@@ -110,7 +110,8 @@ class Result:
         biases: ``stamp``, ``accel_bias`` m/s2, ``gyro_bias`` rad/s, ``accel_bias_std``, ``gyro_bias_std`` in IMU axes.
         warnings: faults and facts worth knowing, one sentence each; what was dropped, with counts and reasons.
         summary: ``imu`` counts, ``aids`` by name (``offered``, ``fused``, ``rejected``, ``late``, ``waiting``,
-            ``nis_mean``, ``nis_in_95``, ``verdicts``), ``datum``, ``restarts``, ``position_resets``, ``final`` state.
+            ``nis_mean``, ``nis_in_95``, ``verdicts``), ``datum``, ``restarts``, ``position_resets``, ``takeovers``,
+            ``final`` state.
         odometry: the rows of the trajectory as the filter gives them (``filter.output.global_odometry.ODOMETRY``), with
             covariances.
     """
@@ -271,6 +272,7 @@ class Filter:
             "datum": None if navigator.datum is None else list(navigator.datum),
             "restarts": navigator.restarts,
             "position_resets": navigator.position_resets,
+            "takeovers": navigator.takeovers,
             "final": final_result(navigator.odometry[0], navigator.datum),
         }
         return Result(

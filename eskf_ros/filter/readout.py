@@ -12,7 +12,7 @@ from eskf_ros.filter.history.buffers import Buffers
 from eskf_ros.filter.history.clock_steps import ClockSteps, Step
 from eskf_ros.filter.history.records import RECORD
 from eskf_ros.filter.integrity.heading_monitor import is_heading_contradicted
-from eskf_ros.filter.integrity.receiver_report import aid_complaints
+from eskf_ros.filter.integrity.receiver_report import aid_complaints, aid_notes
 from eskf_ros.filter.integrity.recovery import phase_of
 from eskf_ros.filter.integrity.repeated_fixes import repeat_complaints
 from eskf_ros.filter.integrity.report import complaints
@@ -169,6 +169,16 @@ class Readout:
         return int(self._states["restarts"][0])
 
     @property
+    def doubt(self) -> float:
+        """How much the noise of the IMU is widened at present: 0 as told, 1 as for the humble lane."""
+        return float(self._states["doubt"][0])
+
+    @property
+    def takeovers(self) -> int:
+        """How often the filter has continued from the humble lane, which predicted the receivers better."""
+        return int(self._states["trust"]["takeovers"][0])
+
+    @property
     def position_resets(self) -> int:
         """How often rejected fixes that agree with each other won over the filter: position and velocity were reset."""
         return int(self._states["recovery"]["resets"][0])
@@ -195,7 +205,7 @@ class Readout:
     @property
     def notes(self) -> list[str]:
         """One sentence for each fact worth knowing of the streams though nothing is wrong."""
-        return self._traffic.notes()
+        return self._traffic.notes() + aid_notes(self._states[0])
 
     @property
     def held_bytes(self) -> int:

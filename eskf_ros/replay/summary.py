@@ -101,6 +101,7 @@ class Summary:
             "imu": navigator.imu_counts,
             "restarts": navigator.restarts,
             "position_resets": navigator.position_resets,
+            "takeovers": navigator.takeovers,
             "wall_s": wall_s,
             "realtime_factor": duration / wall_s,
             "datum": None if navigator.datum is None else list(navigator.datum),

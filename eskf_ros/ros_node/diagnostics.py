@@ -264,6 +264,8 @@ def figures(seen: Snapshot, row: np.void) -> dict[str, object]:
         "odometries published": seen.outputs.published,
         "restarts": seen.navigator.restarts,
         "position resets": seen.navigator.position_resets,
+        "takeovers by the humble lane": seen.navigator.takeovers,
+        "doubt about the IMU": f"{seen.navigator.doubt:.2f}",
         **phases(seen),
         "resets": seen.resets,
         "datum": seen.navigator.datum,

@@ -43,7 +43,7 @@ IMU_READINGS = np.dtype(
 ``smooth_force``, ``smooth_rate``: readings without vibration, averaged over about `SMOOTHING_TIME`.
 """
 
-SMOOTHING_TIME = 0.25
+SMOOTHING_TIME = 0.1
 """s; time constant of the smoothed readings: slower than vibration, faster than a vehicle turns."""
 
 

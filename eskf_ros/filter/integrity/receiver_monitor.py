@@ -66,9 +66,6 @@ LONG_COAST = 5_000_000_000
 MANY_FIXES = 50
 """Fixes that a receiver must have sent before anything of it is reported. Velocities need twice as many."""
 
-MODEST_SCATTER = 0.12
-"""Scatter of the fixes over the standard deviation they claim, below which the claim is reported as too large."""
-
 HIGH_NIS = 2.0
 """Mean NIS of the velocities per degree of freedom above which their covariances are reported as too small."""
 

@@ -12,9 +12,9 @@ from eskf_ros.filter.integrity.receiver_monitor import (
     FEW_DEPARTURES,
     HIGH_NIS,
     MANY_FIXES,
-    MODEST_SCATTER,
     UNLIKELY,
 )
+from eskf_ros.filter.integrity.scatter import NOTABLE_CALM
 from eskf_ros.filter.state.error_state import SOURCES
 
 
@@ -29,8 +29,8 @@ def aid_complaints(state: np.void, settings: np.void) -> list[str]:
         # Those faults explain drifts, contradictions and a high NIS: no sentences of their own.
         found += faults + lies
         if not faults and not lies:
-            found += _path_complaints(state, source)
-            found += _velocity_complaints(state, source) + _departure_complaints(state, source)
+            path = _path_complaints(state, source)
+            found += path or _velocity_complaints(state, source) + _departure_complaints(state, source)
     if state["recovery"]["resets"]:
         cause = "" if found else ": IMU noise parameters too small, or multipath for many seconds"
         found.append(
@@ -84,13 +84,20 @@ def _covariance_complaints(state: np.void, source: int, scale: float) -> list[st
             f"the fixes{_of(source)} scatter {math.sqrt(factor):.1f} times as much as they claim ({scattered} of "
             f"{count}): set gnss.covariance_scale to {factor * scale:.2g}, or gnss.position_std_floor"
         ]
-    share = math.sqrt(float(state["scatter"]["change"][source]))
-    if share < MODEST_SCATTER:
-        return [
-            f"the fixes{_of(source)} scatter {share:.2f} times as much as they claim: they are better than that "
-            "(gnss.covariance_scale), or their errors are the same from fix to fix (gnss.correlation_time)"
-        ]
     return []
+
+
+def aid_notes(state: np.void) -> list[str]:
+    """Return one sentence for each receiver whose fixes err together for long: it is allowed for."""
+    found = []
+    for source in range(SOURCES):
+        change, pairs = float(state["scatter"]["change"][source]), float(state["scatter"]["pairs"][source])
+        if pairs > 2 * MANY_FIXES and change < NOTABLE_CALM and state["scatter"]["lasting"][source] > 0.0:
+            found.append(
+                f"the fixes{_of(source)} change by {math.sqrt(change):.2f} times what they claim from one to the next: "
+                "their errors last. This is allowed for (gnss.correlation_time, gnss.correlated_share)"
+            )
+    return found
 
 
 def _velocity_complaints(state: np.void, source: int) -> list[str]:
