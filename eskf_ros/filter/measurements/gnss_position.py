@@ -29,7 +29,7 @@ NO_ALTITUDE = 9
 UNKNOWN_ALTITUDE_VARIANCE = 1e8
 """m2; of the altitude that stands in for one that is missing: 10 km, which tells the filter nothing."""
 
-LEAST_WHITE = 0.02
+LEAST_WHITE = 0.1
 """Least share of the claimed variance that is taken for new with every fix."""
 
 
