@@ -15,6 +15,7 @@ import numpy as np
 from eskf_ros.filter.alignment.heading_search import SEARCH
 from eskf_ros.filter.alignment.heading_sensors import CANDIDATE
 from eskf_ros.filter.alignment.levelling import LEVELLING
+from eskf_ros.filter.inertial.covariance import EXCITATION
 from eskf_ros.filter.inertial.navigation_frame import FRAME
 from eskf_ros.filter.inertial.strapdown import IMU_READINGS
 from eskf_ros.filter.integrity.heading_corrections import CORRECTIONS
@@ -78,6 +79,7 @@ STATE = np.dtype(
         ("doubt", "f8"),
         # The records of the rooms.
         ("imu", IMU_READINGS),
+        ("excitation", EXCITATION),
         ("frame", FRAME),
         ("odom", STEP),
         ("search", SEARCH),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.heading_search import predict_search
-from eskf_ros.filter.inertial.covariance import propagate_covariance, propagate_noise
+from eskf_ros.filter.inertial.covariance import credible_force, propagate_covariance, propagate_noise
 from eskf_ros.filter.inertial.strapdown import propagate_nominal_state
 from eskf_ros.filter.state import augmented_states
 from eskf_ros.filter.state.error_state import ERROR_SIZE
@@ -39,9 +39,10 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
         acceleration = (force[0] + gravity[0], force[1] + gravity[1], force[2] + gravity[2])
         predict_search(state, acceleration, middle, dt, settings)
         velocity_noise += WANDER_TIME * (WANDER_ACCELERATION**2 + dot(acceleration, acceleration))
-    size = state.error_size
-    propagate_covariance(state.covariance, size, middle, force, gravity, state.frame.earth_rate_map, dt, coupling, work)
-    propagate_noise(state.covariance, velocity_noise, attitude_noise, accel_walk, gyro_walk, dt)
+    size, covariance = state.error_size, state.covariance
+    force = credible_force(state.excitation, covariance, middle, force, gravity, dt, settings.accel_noise_density)
+    propagate_covariance(covariance, size, middle, force, gravity, state.frame.earth_rate_map, dt, coupling, work)
+    propagate_noise(covariance, velocity_noise, attitude_noise, accel_walk, gyro_walk, dt)
     if size > ERROR_SIZE:
         augmented_states.propagate_augmented(state, dt, settings)
 

@@ -127,28 +127,6 @@ def from_roll_pitch_yaw(roll, pitch, yaw):
 
 
 @njit
-def left_jacobian(v):
-    """Return the left Jacobian of SO(3) at rotation vector ``v`` as three row tuples (Sola, eq. 145).
-
-    log(exp(v + d) exp(-v)) = J d to first order in d: what resets the error state after ``v`` has been injected.
-    """
-    angle2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
-    if angle2 < 1e-8:
-        a = 0.5 - angle2 / 24.0
-        b = 1.0 / 6.0 - angle2 / 120.0
-    else:
-        angle = math.sqrt(angle2)
-        a = (1.0 - math.cos(angle)) / angle2
-        b = (angle - math.sin(angle)) / (angle2 * angle)
-    x, y, z = v[0], v[1], v[2]
-    return (
-        (1.0 - b * (y * y + z * z), -a * z + b * x * y, a * y + b * x * z),
-        (a * z + b * x * y, 1.0 - b * (x * x + z * z), -a * x + b * y * z),
-        (-a * y + b * x * z, a * x + b * y * z, 1.0 - b * (x * x + y * y)),
-    )
-
-
-@njit
 def wrapped(angle):
     """Return ``angle`` (rad) wrapped to [-pi, pi)."""
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))

@@ -146,8 +146,13 @@ def tolerance(dt: float) -> Array:
 
 
 def state_near_datum(seed: int) -> Any:
-    """Return a running filter at small coordinates, so that differences of positions keep their digits."""
-    return random_state(seed, far=10.0)
+    """Return a running filter at small coordinates, so that differences of positions keep their digits.
+
+    That it accelerates is beyond doubt: F has the whole force.
+    """
+    state = random_state(seed, far=10.0)
+    state["excitation"]["acceleration"] = (1e9, 0.0, 0.0)
+    return state
 
 
 @pytest.mark.parametrize("dt", [0.001, 0.005, 0.02])
@@ -211,6 +216,7 @@ def dense_noise(dt: float, gap: float = 0.0) -> Array:
 @pytest.mark.parametrize("seed", range(4))
 def test_propagation_is_the_dense_product(seed: int, dt: float, gap: float) -> None:
     state, samples = random_state(seed), readings(seed, dt)
+    state["excitation"]["acceleration"] = (1e9, 0.0, 0.0)
     before = random_covariance(seed, USUAL_STDS)
     transition = transition_of_step(state, samples, dt)
     core(state)[:] = before
@@ -264,3 +270,64 @@ def test_transformed_attitude_error(seed: int) -> None:
     full = np.eye(15)
     full[6:9, 6:9] = matrix
     np.testing.assert_allclose(after, full @ before @ full.T, rtol=1e-12, atol=1e-18)
+
+
+def still_for(seconds: float, settings: Any, state: Any, seed: int) -> Any:
+    """Propagate ``state`` through the noise of an accelerometer at rest, told in ``settings``; 100 Hz."""
+    rng = np.random.default_rng(seed)
+    std = float(settings["accel_noise_density"]) / np.sqrt(0.01)
+    for force in rng.normal((0.0, 0.0, 9.81), std, (round(100.0 * seconds), 3)):
+        step(state, tuples(force), (0.0, 0.0, 0.0), tuples(force), (0.0, 0.0, 0.0), 0.01, 0.0, settings, WORK)
+    return state
+
+
+def heading_in_velocity(state: Any) -> float:
+    """Correlation of the heading error with the horizontal velocity error."""
+    covariance = core(state)
+    return float(np.abs(covariance[3:5, 8] / np.sqrt(np.diag(covariance)[3:5] * covariance[8, 8])).max())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_noise_of_the_accelerometer_does_not_show_the_heading(seed: int) -> None:
+    """A minute at rest ties the velocity, which GNSS will measure, to no unknown heading; an acceleration does."""
+    # Without a datum the Earth does not turn, which would show the heading too, a little.
+    state = make_state(datum=None)
+    core(state)[8, 8] = 0.03
+    assert heading_in_velocity(still_for(60.0, SETTINGS, state, seed)) < 2e-3
+    for _ in range(200):
+        step(state, (1.0, 0.0, 9.81), (0.0, 0.0, 0.0), (1.0, 0.0, 9.81), (0.0, 0.0, 0.0), 0.01, 0.0, SETTINGS, WORK)
+    assert heading_in_velocity(state) > 0.3
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_an_acceleration_that_may_be_tilt_does_not_show_the_heading(known: bool) -> None:
+    """0.3 m/s2 for two seconds, 0.6 m/s: not with a tilt uncertain by three degrees, mostly with one of a milliradian."""
+    state = make_state(datum=None)
+    core(state)[6:9, 6:9] = np.diag([0.001**2, 0.001**2, 0.03] if known else [0.05**2, 0.05**2, 0.03])
+    for _ in range(200):
+        step(state, (0.3, 0.0, 9.81), (0.0, 0.0, 0.0), (0.3, 0.0, 9.81), (0.0, 0.0, 0.0), 0.01, 0.0, SETTINGS, WORK)
+    shown = abs(core(state)[4, 8]) / core(state)[8, 8]
+    assert 0.35 < shown < 0.6 if known else shown == 0.0
+
+
+def test_small_share_of_a_mean_acceleration_at_the_edge() -> None:
+    """The share grows from zero at three standard deviations towards one: there is no step."""
+    noise, gravity = 0.03, (0.0, 0.0, -9.81)
+    edge = 3.0 * noise / np.sqrt(2.0)
+    excitation = make_state()["excitation"]
+    shares = []
+    for factor in (0.99, 1.01, 3.0, 30.0):
+        level = factor * edge
+        excitation["acceleration"] = (level, 0.0, 0.0)
+        force = kernel.credible_force(
+            excitation,
+            np.zeros((15, 15)),
+            ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+            (level, 0.0, 9.81),
+            gravity,
+            0.01,
+            noise,
+        )
+        assert force[2] == pytest.approx(9.81)
+        shares.append(force[0] / level)
+    np.testing.assert_allclose(shares, [0.0, 1.0 - 1.01**-2, 1.0 - 1.0 / 9.0, 1.0 - 1.0 / 900.0], rtol=1e-9, atol=0.0)

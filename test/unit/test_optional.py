@@ -51,6 +51,8 @@ def joined(seed: int) -> Any:
     augmented_states.update_error_size(state, LASTING["reach"][Stream.GNSS_POSITION], LASTING)
     state["covariance"][:SIZE, :SIZE] = random_covariance(seed, STDS)
     state["optional"][:3] = np.random.default_rng(seed).normal(size=3)
+    # That it accelerates is beyond doubt: F has the whole force.
+    state["excitation"]["acceleration"] = (1e9, 0.0, 0.0)
     return state
 
 

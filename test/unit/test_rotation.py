@@ -111,27 +111,6 @@ def test_roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> None:
     assert_same(rotation.from_roll_pitch_yaw(roll, pitch, yaw), Rotation.from_euler("xyz", [roll, pitch, yaw]))
 
 
-@given(rotation_vectors)
-def test_left_jacobian(v: Array) -> None:
-    """log(exp(v + d) exp(-v)) = J d: central differences, whose own error is 1e-10."""
-    jacobian = matrix_of(rotation.left_jacobian(tuples(v)))
-    h = 1e-5
-    for axis in range(3):
-        step = h * np.eye(3)[axis]
-        after, before = (
-            (Rotation.from_rotvec(v + k * step) * Rotation.from_rotvec(v).inv()).as_rotvec() for k in (1.0, -1.0)
-        )
-        np.testing.assert_allclose(jacobian[:, axis], (after - before) / (2.0 * h), rtol=0.0, atol=1e-9)
-
-
-def test_left_jacobian_has_no_step_at_the_series() -> None:
-    for axis in (np.array([1.0, 0.0, 0.0]), np.array([0.6, -0.64, 0.48])):
-        below, above = (
-            matrix_of(rotation.left_jacobian(tuples(axis * 1e-4 * factor))) for factor in (1.0 - 1e-9, 1.0 + 1e-9)
-        )
-        np.testing.assert_allclose(below, above, rtol=0.0, atol=2e-12)
-
-
 @given(vectors, vectors)
 def test_products(a: tuple[float, float, float], b: tuple[float, float, float]) -> None:
     np.testing.assert_allclose(rotation.cross(a, b), np.cross(a, b), rtol=0.0, atol=1e-15)

@@ -13,16 +13,68 @@ new velocity error the position. This transition matrix has nine rows other than
 formed: it is applied to the columns of P, and again to the columns of the transpose of the result. The bias rows do not
 change, so the second round has nine columns only. The core does not depend on the augmented states: the transition acts
 on their columns alone.
+
+The force in F is not the measured one: of its horizontal part only as much enters as stands out from its own error
+(`credible_force`).
 """
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from eskf_ros.compiled import njit
-from eskf_ros.filter.state.error_state import ACCEL_BIAS, ERROR_SIZE
+from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE
 from eskf_ros.geodesy.earth import SEMI_MAJOR_AXIS
-from eskf_ros.geodesy.rotation import rotate
+from eskf_ros.geodesy.rotation import dot, rotate
+
+ACCELERATION_TIME = 1.0
+"""s; time constant of the mean acceleration that `credible_force` judges. Vehicles accelerate for about so long."""
+
+CREDIBLE = 3.0
+"""Standard deviations (per axis) of the mean acceleration below which none of it is believed; of noise 1 % is above."""
+
+EXCITATION = np.dtype([("acceleration", "f8", (3,))], align=True)
+"""Horizontal acceleration (m/s2, map), low-passed with `ACCELERATION_TIME`."""
+
+
+@njit
+def credible_force(excitation, covariance, rotation, force, gravity, dt, noise_density):
+    """Return the specific force (m/s2, map) of the error dynamics, and advance `EXCITATION` by ``dt`` s.
+
+    A horizontal acceleration turns an error of the heading into one of the velocity: it shows the heading. So do, in
+    F, the noise of the accelerometer and an error of tilt or bias, though the robot stands still; the heading would
+    grow certain of nothing. Therefore the horizontal part of ``force`` is scaled by 1 - (k s / a)^2, or zero: a is the
+    low-passed horizontal acceleration, s its standard deviation from white noise (``noise_density``, m/s2/rtHz; Gelb,
+    section 3.8) and from the covariance, k `CREDIBLE`. Far from the datum s is about the horizontal of map, a few
+    degrees off.
+    """
+    along = dot(force, gravity) / dot(gravity, gravity)
+    vertical = (along * gravity[0], along * gravity[1], along * gravity[2])
+    level = (force[0] - vertical[0], force[1] - vertical[1], force[2] - vertical[2])
+    mean = excitation.acceleration
+    for i in range(3):
+        mean[i] += dt / ACCELERATION_TIME * (level[i] - mean[i])
+    square = mean[0] * mean[0] + mean[1] * mean[1] + mean[2] * mean[2]
+    noise = noise_density**2 / (2.0 * ACCELERATION_TIME)
+    doubted = CREDIBLE**2 * (noise + acceleration_variance(covariance, rotation, vertical))
+    share = 1.0 - doubted / square if square > doubted else 0.0
+    return (vertical[0] + share * level[0], vertical[1] + share * level[1], vertical[2] + share * level[2])
+
+
+@njit
+def acceleration_variance(covariance, rotation, force):
+    """Return the variance (m2/s4, mean of the axes x and y of map) of theta x ``force`` - R dba."""
+    total = 0.0
+    for axis in range(2):
+        r = rotation[axis]
+        turned = (0.0, force[2], -force[1]) if axis == 0 else (-force[2], 0.0, force[0])
+        row = (turned[0], turned[1], turned[2], -r[0], -r[1], -r[2])
+        for i in range(6):
+            for j in range(6):
+                total += row[i] * row[j] * covariance[ATTITUDE + i, ATTITUDE + j]
+    return 0.5 * total
 
 
 @njit

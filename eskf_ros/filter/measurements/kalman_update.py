@@ -8,9 +8,10 @@ import numpy as np
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.covariance import update_error_axes
+from eskf_ros.filter.inertial.navigation_frame import local_up
 from eskf_ros.filter.state.enums import Verdict
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, VELOCITY
-from eskf_ros.geodesy.rotation import from_rotation_vector, left_jacobian, multiply, normalized
+from eskf_ros.geodesy.rotation import dot, from_rotation_vector, multiply, normalized, to_matrix
 
 
 @njit
@@ -68,9 +69,23 @@ def apply(state, size, work):
         work.correction[i] = correction
     update_covariance(state, size, work)
     update_nominal_state(state, work.correction)
-    # The error is now about the injected attitude (Sola, section 6.3.1, with the full Jacobian).
-    turn = (work.correction[ATTITUDE], work.correction[ATTITUDE + 1], work.correction[ATTITUDE + 2])
-    update_error_axes(state.covariance, ATTITUDE, left_jacobian(turn))
+    reset_attitude_error(state, work.correction)
+
+
+@njit
+def reset_attitude_error(state, correction):
+    """Turn the covariance of the attitude error about the vertical, by the correction of the heading.
+
+    R_true = exp(heading error) exp(tilt error) R. GNSS and gravity do not see a turn of all about the vertical: what
+    stays unknown is a factor on the far left, whatever the tilt is corrected by, and its axis must stay the vertical.
+    The Jacobian of the one rotation vector (Sola, section 6.3.1) tips it by half of each correction of the tilt; these
+    corrections follow the noise of the gyro for ever, and the filter would learn the heading from it. The tilt error
+    turns with a corrected heading, as the accelerometer bias does that it is correlated with.
+    """
+    up = local_up(state)
+    angle = dot(up, (correction[ATTITUDE], correction[ATTITUDE + 1], correction[ATTITUDE + 2]))
+    turn = to_matrix(from_rotation_vector((angle * up[0], angle * up[1], angle * up[2])))
+    update_error_axes(state.covariance, ATTITUDE, turn)
 
 
 @njit
