@@ -255,3 +255,22 @@ def test_a_gain_frozen_after_convergence_is_worse_through_a_tunnel_and_after_it(
     assert ratio(tunnel[0] - 20.0, tunnel[0], heading) > 2.0
     assert ratio(tunnel[1] - 15.0, tunnel[1], horizontal) > 1.2
     assert ratio(tunnel[1] + 5.0, tunnel[1] + 20.0, horizontal) > 5.0
+
+
+def test_a_parked_robot_does_not_grow_certain_of_the_heading_it_was_given() -> None:
+    """Ten minutes of noise show no heading: what was given to 10 degrees stays known to 10 degrees.
+
+    Would fail with the measured force in the dynamics of the error, or with an attitude error that tips at each update.
+    """
+    given_std = 10.0
+    recording = simulate("parked", 3, imu_rate=50.0, stop=600.0)
+    for told in (True, False):
+        parameters = {
+            name: value for name, value in recording.parameters().items() if told or not name.endswith("noise_density")
+        }
+        parameters["alignment.initial_heading_deg"] = SCENARIOS["parked"].heading_deg + given_std
+        parameters["alignment.initial_heading_std_deg"] = given_std
+        navigator = Navigator(from_mapping(parameters))
+        for _, state in feed(recording, navigator, np.array([len(recording.imu_stamp) - 1])):
+            assert state["heading_known"]
+            assert math.degrees(math.sqrt(core(state)[8, 8])) == pytest.approx(given_std, rel=0.05)
