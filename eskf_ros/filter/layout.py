@@ -17,6 +17,8 @@ from eskf_ros.filter.alignment.heading_sensors import CANDIDATE
 from eskf_ros.filter.alignment.levelling import LEVELLING
 from eskf_ros.filter.inertial.covariance import EXCITATION
 from eskf_ros.filter.inertial.navigation_frame import FRAME
+from eskf_ros.filter.inertial.sample_quality import LEAST_FORCE_JUMP, LEAST_RATE_JUMP, SAMPLE_QUALITY
+from eskf_ros.filter.inertial.stamps import IMU_STAMPS
 from eskf_ros.filter.inertial.strapdown import IMU_READINGS
 from eskf_ros.filter.integrity.heading_corrections import CORRECTIONS
 from eskf_ros.filter.integrity.heading_monitor import HEADING_MONITOR
@@ -80,6 +82,8 @@ STATE = np.dtype(
         # The records of the rooms.
         ("imu", IMU_READINGS),
         ("excitation", EXCITATION),
+        ("stamps", IMU_STAMPS),
+        ("quality", SAMPLE_QUALITY),
         ("frame", FRAME),
         ("odom", STEP),
         ("search", SEARCH),
@@ -227,6 +231,7 @@ WORK = np.dtype(
 
 _NEVER = {
     "imu": ("stamp",),
+    "stamps": ("raw",),
     "window": (
         "start",
         "still_stamp",
@@ -277,6 +282,9 @@ def blank_state() -> np.ndarray:
             state[room][field] = NEVER
     for field in ("spread", "change", "white", "velocity"):
         state["scatter"][field] = 1.0
+    state["stamps"]["even"] = 1.0
+    state["quality"]["least_jump"] = np.repeat((LEAST_FORCE_JUMP**2, LEAST_RATE_JUMP**2), 3)
+    state["quality"]["lowest"], state["quality"]["highest"] = np.inf, -np.inf
     state["attitude"][:, 0] = 1.0
     state["levelling"]["kept_gyro_variance"] = np.inf
     state["error_size"] = ERROR_SIZE

@@ -7,6 +7,8 @@ from eskf_ros.filter.alignment.levelling import update_level
 from eskf_ros.filter.fuse import fuse
 from eskf_ros.filter.history.timeline import rewind, save_checkpoint
 from eskf_ros.filter.inertial.navigation_frame import heading_of
+from eskf_ros.filter.inertial.sample_quality import judge_sample
+from eskf_ros.filter.inertial.stamps import take_stamp
 from eskf_ros.filter.inertial.strapdown import SMOOTHING_TIME
 from eskf_ros.filter.integrity.imu_monitor import watch_input, watch_interval
 from eskf_ros.filter.integrity.restart import reset_alignment
@@ -36,14 +38,16 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
     row_count = 0
     while state.imu_next < t.imu_count:
         sample = imu[state.imu_next]
+        previous_stamp = state.stamps.raw
+        instant = take_stamp(state, sample.stamp)
+        judge_sample(state, sample, instant, settings)
 
-        while state.aid_next < t.aid_count and aids[state.aid_next].stamp < sample.stamp:
-            predict(states, aids[state.aid_next].stamp, sample, settings, work)
+        while state.aid_next < t.aid_count and aids[state.aid_next].stamp < instant:
+            predict(states, aids[state.aid_next].stamp, sample, instant, settings, work)
             state.aid_next = fuse_next(states, aids, t.aid_count, settings, work)
 
-        previous_stamp = state.imu.stamp
-        predict(states, sample.stamp, sample, settings, work)
-        take_sample(state, sample)
+        predict(states, instant, sample, instant, settings, work)
+        take_sample(state, sample, instant)
         states[HUMBLE].imu.interval = state.imu.interval
         watch_interval(state, settings)
         measure_step(state, settings)
@@ -55,7 +59,7 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
         if is_new:
             carry(local, state, settings)
 
-        while state.aid_next < t.aid_count and aids[state.aid_next].stamp == sample.stamp:
+        while state.aid_next < t.aid_count and aids[state.aid_next].stamp == instant:
             state.aid_next = fuse_next(states, aids, t.aid_count, settings, work)
 
         if is_new and is_on_grid(previous_stamp, sample.stamp, settings.output_interval):
@@ -66,17 +70,20 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
 
 
 @njit
-def predict(states, stamp, sample, settings, work):
-    """Propagate the lanes to ``stamp`` (ns), at or before the next IMU sample; restart after a long silence."""
+def predict(states, stamp, sample, instant, settings, work):
+    """Propagate the lanes to ``stamp`` (ns), at or before the next IMU sample, which is of the time ``instant`` (ns).
+
+    After a long silence of the IMU the alignment starts again.
+    """
     state = states[FILTER]
     if state.level_known == 0:
         return
-    if sample.stamp - state.imu.stamp > LONGEST_GAP:
+    if instant - state.imu.stamp > LONGEST_GAP:
         position = (state.position_map[0], state.position_map[1], state.position_map[2])
         reset_alignment(state)
         note_jump(state, position, heading_of(state, settings), settings)
         return
-    propagate(states, stamp, sample, settings, work)
+    propagate(states, stamp, sample, instant, settings, work)
 
 
 @njit
@@ -91,12 +98,12 @@ def update_rest(state, settings):
 
 
 @njit
-def take_sample(state, sample):
-    """Make an IMU sample the newest reading of the state."""
+def take_sample(state, sample, instant):
+    """Make an IMU sample of the time ``instant`` (ns) the newest reading of the state."""
     if state.imu.stamp != NEVER:
-        state.imu.interval = (sample.stamp - state.imu.stamp) * 1e-9
-    state.imu.stamp = sample.stamp
-    state.stamp = sample.stamp
+        state.imu.interval = (instant - state.imu.stamp) * 1e-9
+    state.imu.stamp = instant
+    state.stamp = instant
     state.imu_next += 1
     # No weight above one: the first reading, and the one after a gap, stand for themselves.
     weight = min(1.0, state.imu.interval / SMOOTHING_TIME)

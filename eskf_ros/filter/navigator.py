@@ -589,7 +589,7 @@ class Navigator(Readout):
         records = allocate(
             RECORD, max(1, int(self._buffers.timeline["aid_count"][0] - self._buffers.timeline["recorded"][0]))
         )
-        count = take_final(self._buffers.aids, self._buffers.timeline, records, everything)
+        count = take_final(self._states, self._buffers.aids, self._buffers.timeline, records, everything)
         refused, self._refused = self._refused, []
         self._traffic.note_final(records[:count])
         return np.concatenate([np.array(records[:count], RECORD), *refused])

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.heading_search import predict_search
-from eskf_ros.filter.inertial.covariance import credible_force, propagate_covariance, propagate_noise
+from eskf_ros.filter.inertial.covariance import (
+    credible_force,
+    propagate_axis_noise,
+    propagate_covariance,
+    propagate_noise,
+)
 from eskf_ros.filter.inertial.strapdown import propagate_nominal_state
 from eskf_ros.filter.state import augmented_states
 from eskf_ros.filter.state.error_state import ERROR_SIZE
@@ -15,6 +20,11 @@ from eskf_ros.geodesy.rotation import dot
 LONGEST_STEP = 20_000_000
 """ns; a longer IMU interval is integrated in equal steps of at most this length."""
 
+LONGEST_RATIO = 2.5
+"""The slope between the last two samples is believed over an interval of at most this many times their distance: its
+noise grows with the ratio.
+"""
+
 WANDER_ACCELERATION = 0.5
 """m/s2; acceleration of the robot beyond the measured one that is assumed with an unknown heading (process noise)."""
 
@@ -23,10 +33,10 @@ WANDER_TIME = 1.0
 
 
 @njit
-def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
+def step(state, quality, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
     """Propagate one lane by ``dt`` s between two raw IMU readings (m/s2, rad/s; IMU axes).
 
-    ``gap`` (s) is the length of the hole in the IMU data that is being bridged, 0 for none.
+    ``quality`` says which axes are doubted (`inertial.sample_quality`). ``gap`` (s) is the length of the hole in the IMU data that is being bridged, 0 for none.
     """
     # With an unknown heading the direction of the measured acceleration on the map is unknown: it is not integrated.
     coupling = 0.0 if state.heading_known == 0 else 1.0
@@ -43,6 +53,8 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
     force = credible_force(state.excitation, covariance, middle, force, gravity, dt, settings.accel_noise_density)
     propagate_covariance(covariance, size, middle, force, gravity, state.frame.earth_rate_map, dt, coupling, work)
     propagate_noise(covariance, velocity_noise, attitude_noise, accel_walk, gyro_walk, dt)
+    if quality.is_doubted == 1:
+        propagate_axis_noise(covariance, middle, quality.doubt, dt)
     if size > ERROR_SIZE:
         augmented_states.propagate_augmented(state, dt, settings)
 
@@ -73,15 +85,15 @@ def between_noise(told, humble, doubt):
 
 
 @njit
-def propagate(states, stamp, sample, settings, work):
-    """Propagate the lanes to ``stamp`` (ns), at or before ``sample``, the next IMU sample.
+def propagate(states, stamp, sample, instant, settings, work):
+    """Propagate the lanes to ``stamp`` (ns), at or before ``instant`` (ns), the time of the next ``sample``.
 
     Between two samples the IMU is the straight line whose mean is that of the parabola through them and the sample
     before (Adams-Moulton): an interval gives the same result wherever it is cut. A long interval is integrated in
     steps; one longer than the gap of the settings may hide motion and adds process noise.
     """
     state = states[FILTER]
-    interval = (sample.stamp - state.imu.stamp) / SECOND
+    interval = (instant - state.imu.stamp) / SECOND
     force_0, force_1 = line(state.imu.earlier_force, state.imu.force, sample.specific_force, interval, state, settings)
     rate_0, rate_1 = line(state.imu.earlier_rate, state.imu.rate, sample.angular_rate, interval, state, settings)
     gap = interval if interval > settings.imu_gap else 0.0
@@ -96,9 +108,9 @@ def propagate(states, stamp, sample, settings, work):
         fraction = begin + (end - begin) * (k + 1) / steps
         force_b = between(force_0, force_1, fraction)
         rate_b = between(rate_0, rate_1, fraction)
-        step(state, force_a, rate_a, force_b, rate_b, dt, gap, settings, work)
+        step(state, state.quality, force_a, rate_a, force_b, rate_b, dt, gap, settings, work)
         if humble:
-            step(states[HUMBLE], force_a, rate_a, force_b, rate_b, dt, gap, settings, work)
+            step(states[HUMBLE], state.quality, force_a, rate_a, force_b, rate_b, dt, gap, settings, work)
         force_a = force_b
         rate_a = rate_b
     force = between(state.imu.force, sample.specific_force, end)
@@ -114,7 +126,8 @@ def propagate(states, stamp, sample, settings, work):
 def line(earlier, last, following, interval, state, settings):
     """Return the ends of the straight line that stands for the IMU between two samples (see `propagate`)."""
     bend = 0.0
-    if interval <= settings.imu_gap and 0.0 < state.imu.interval <= settings.imu_gap:
+    longest = min(settings.imu_gap, LONGEST_RATIO * state.imu.interval)
+    if interval <= longest and state.imu.interval <= settings.imu_gap:
         bend = interval * interval / (6.0 * (interval + state.imu.interval))
     shift = (
         bend * ((following[0] - last[0]) / interval - (last[0] - earlier[0]) / state.imu.interval),

@@ -16,6 +16,7 @@ from eskf_ros.filter.integrity.receiver_report import aid_complaints, aid_notes
 from eskf_ros.filter.integrity.recovery import phase_of
 from eskf_ros.filter.integrity.repeated_fixes import repeat_complaints
 from eskf_ros.filter.integrity.report import complaints
+from eskf_ros.filter.integrity.sample_report import sample_complaints
 from eskf_ros.filter.integrity.traffic import Traffic, imu_complaints
 from eskf_ros.filter.layout import STATE
 from eskf_ros.filter.output.global_odometry import ODOMETRY, write_odometry
@@ -191,7 +192,7 @@ class Readout:
     def complaints(self) -> list[str]:
         """One sentence for each fault of a stream, with what to do; empty without faults."""
         state = self._states[0]
-        found = complaints(state) + repeat_complaints(state)
+        found = complaints(state) + repeat_complaints(state) + sample_complaints(state)
         # A wrong heading makes the fixes look faulty: warnings about the receivers would mislead.
         if not is_heading_contradicted(state):
             found += aid_complaints(state, self._settings[0])

@@ -163,13 +163,13 @@ def run_samples(
 def _run_samples(state, samples, cuts, settings, work):
     state.imu.stamp = NEVER
     state.imu.interval = 1e9
-    take_sample(state, samples[0])
+    take_sample(state, samples[0], samples[0].stamp)
     cut = 0
     for k in range(1, len(samples)):
         sample = samples[k]
         while cut < len(cuts) and cuts[cut] < sample.stamp:
             if cuts[cut] > state.stamp:
-                predict.propagate(state, cuts[cut], sample, settings, work)
+                predict.propagate(state, cuts[cut], sample, sample.stamp, settings, work)
             cut += 1
-        predict.propagate(state, sample.stamp, sample, settings, work)
-        take_sample(state, sample)
+        predict.propagate(state, sample.stamp, sample, sample.stamp, settings, work)
+        take_sample(state, sample, sample.stamp)

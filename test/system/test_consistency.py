@@ -178,11 +178,14 @@ class FrozenGain:
                 self.next_fix < len(recording.fix_stamp) and recording.fix_stamp[self.next_fix] < self.sample["stamp"]
             ):
                 fix_stamp = int(recording.fix_stamp[self.next_fix])
-                predict.propagate(self.state, fix_stamp, self.sample, self.settings, self.work)
+                predict.propagate(
+                    self.state, fix_stamp, self.sample, int(self.sample["stamp"]), self.settings, self.work
+                )
                 self.correct(self.next_fix)
                 self.next_fix += 1
-            predict.propagate(self.state, recording.imu_stamp[i], self.sample, self.settings, self.work)
-            loop.take_sample(self.state, self.sample)
+            sample_stamp = int(recording.imu_stamp[i])
+            predict.propagate(self.state, sample_stamp, self.sample, sample_stamp, self.settings, self.work)
+            loop.take_sample(self.state, self.sample, sample_stamp)
             self.next_imu += 1
 
     def correct(self, k: int) -> None:

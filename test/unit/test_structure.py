@@ -47,7 +47,7 @@ WRITERS = {
     "alignment/heading.py": {"reset_heading"},
     "alignment/heading_sensors.py": {"reset_given_heading"},
     "alignment/levelling.py": {"reset_tilt", "update_gyro_bias_at_rest", "reset_level_to_moving"},
-    "inertial/covariance.py": {"propagate_noise", "propagate_covariance", "update_error_axes"},
+    "inertial/covariance.py": {"propagate_noise", "propagate_axis_noise", "propagate_covariance", "update_error_axes"},
     "inertial/navigation_frame.py": {"reset_attitude", "reset_datum"},
     "inertial/strapdown.py": {"propagate_nominal_state"},
     "integrity/fix_tracker.py": {"inflate_position_for_scatter"},

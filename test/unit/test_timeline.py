@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -131,6 +132,27 @@ def test_arrival_order_changes_no_bit(recording, seed, doubled, imu_delay, posit
     other_state, other_records, _ = result(recording, shuffled)
     assert other_records == records
     assert other_state == state
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("kind", ["jitter", "bursts"])
+def test_arrival_order_changes_no_bit_where_imu_stamps_scatter(recording, kind, seed):
+    """The state then stands beside the stamp of its last sample, and the two rewind apart."""
+    random = np.random.default_rng(seed)
+    stamps = recording.imu_stamp.copy()
+    if kind == "jitter":
+        stamps += np.round(4e6 * random.normal(size=len(stamps))).astype(np.int64)
+        stamps = np.maximum.accumulate(stamps) + np.arange(len(stamps))
+    else:
+        stamps = stamps[np.minimum(np.arange(len(stamps)) // 4 * 4 + 3, len(stamps) - 1)] + np.arange(len(stamps))
+    scattered = dataclasses.replace(recording, imu_stamp=stamps)
+    messages = every_message(scattered, random, 0.1)
+    state, records, together = result(scattered, arriving(scattered, messages, random, (0.0, 0.0, 0.0)))
+    assert np.mean(together["verdict"] == Verdict.FUSED) > 0.7
+    for delays in ((0.5, 1.0, WINDOW), (WINDOW, WINDOW, 0.3)):
+        other_state, other_records, _ = result(scattered, arriving(scattered, messages, random, delays))
+        assert other_records == records
+        assert other_state == state
 
 
 def test_sorted_arrival_does_fuse(recording):

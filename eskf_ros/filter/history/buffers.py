@@ -33,7 +33,7 @@ class Buffers:
         self.timeline = allocate(TIMELINE)
         for field in ("frontier", "published", "barrier"):
             self.timeline[field] = NEVER
-        self.timeline["rewind_to"] = -NEVER
+        self.timeline["rewind_to"] = self.timeline["rewind_sample"] = -NEVER
         self.timeline["window"] = window
 
     @property

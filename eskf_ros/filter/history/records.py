@@ -58,6 +58,7 @@ TIMELINE = np.dtype(
         ("frontier", "i8"),
         ("published", "i8"),
         ("rewind_to", "i8"),
+        ("rewind_sample", "i8"),
         ("window", "i8"),
         ("barrier", "i8"),
         ("furthest_late", "i8"),
@@ -77,7 +78,8 @@ TIMELINE = np.dtype(
   checkpoint.
 - ``recorded``: measurements at the head of the buffer whose final record was handed out.
 - ``frontier``: the newest IMU stamp; ``published``: the newest stamp for which a row was written.
-- ``rewind_to``: the stamp from which the next advance has to start.
+- ``rewind_to``, ``rewind_sample``: the time of the state, and the stamp of its last IMU sample, from which the next
+  advance has to start at the latest. The two differ where the stamps of the IMU jitter (`inertial/stamps.py`).
 - ``window``, ``barrier``: messages older than the frontier minus the window, or than the barrier, are refused.
 - ``furthest_late``: the largest lateness (ns) refused.
 - ``imu_*``: IMU samples offered, and refused or replaced by reason.

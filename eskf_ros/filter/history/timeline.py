@@ -50,12 +50,6 @@ LONGEST_STEP = 1_000_000_000
 
 
 @njit
-def go_back_to(timeline, stamp):
-    """Let the next advance start from a checkpoint not later than ``stamp`` (ns)."""
-    timeline.rewind_to = min(timeline.rewind_to, stamp)
-
-
-@njit
 def oldest_in_time(timeline):
     """Return the oldest stamp (ns) that is still accepted: within the window, and after the last barrier."""
     return max(timeline.frontier - timeline.window, timeline.barrier)
@@ -63,16 +57,24 @@ def oldest_in_time(timeline):
 
 @njit
 def rewind(states, checkpoints, timeline, blank):
-    """Restore the newest checkpoint not later than ``timeline.rewind_to``, or ``blank``, and drop the later ones."""
-    if timeline.rewind_to > states[FILTER].stamp:
-        timeline.rewind_to = -NEVER
+    """Restore the newest checkpoint that knows nothing later than what has come in, or ``blank``; drop the later ones.
+
+    That is at ``timeline.rewind_to`` at the latest, and its last IMU sample is stamped ``timeline.rewind_sample`` at
+    the latest.
+    """
+    state = states[FILTER]
+    if timeline.rewind_to > state.stamp and timeline.rewind_sample > state.stamps.raw:
+        timeline.rewind_to = timeline.rewind_sample = -NEVER
         return
     count = timeline.checkpoint_count
-    while count > 0 and checkpoints[count - 1, FILTER].stamp > timeline.rewind_to:
+    while count > 0 and (
+        checkpoints[count - 1, FILTER].stamp > timeline.rewind_to
+        or checkpoints[count - 1, FILTER].stamps.raw > timeline.rewind_sample
+    ):
         count -= 1
     timeline.checkpoint_count = count
     timeline.since_checkpoint = 0
-    timeline.rewind_to = -NEVER
+    timeline.rewind_to = timeline.rewind_sample = -NEVER
     for lane in range(LANES):
         if count > 0:
             states[lane] = checkpoints[count - 1, lane]
@@ -140,7 +142,7 @@ def begin_again(aids, timeline):
     timeline.frontier = NEVER
     timeline.published = NEVER
     timeline.furthest_late = 0
-    go_back_to(timeline, NEVER)
+    timeline.rewind_to = timeline.rewind_sample = NEVER
 
 
 @njit
@@ -198,7 +200,7 @@ def insert_imu(imu, aids, timeline, locals_, settings_, stamps, specific_force, 
             imu[place].specific_force[i] = force[i]
             imu[place].angular_rate[i] = rate[i]
         if stamp <= t.frontier:
-            go_back_to(t, imu[place - 1].stamp if place > 0 else NEVER)
+            t.rewind_sample = min(t.rewind_sample, imu[place - 1].stamp if place > 0 else NEVER)
         t.frontier = max(t.frontier, stamp)
     return k
 
@@ -241,6 +243,8 @@ def add_constraint(aids, t, stream, stamp):
     for i in range(len(aid.payload)):
         aid.payload[i] = 0.0
     t.aid_count += 1
+    # The state may be ahead of the stamps of the IMU.
+    t.rewind_to = min(t.rewind_to, stamp)
 
 
 @njit
@@ -307,7 +311,7 @@ def insert_aid(aids, timeline, offered):
         aids[i] = aids[i - 1]
     aids[place] = aid
     t.aid_count += 1
-    go_back_to(t, aid.stamp)
+    t.rewind_to = min(t.rewind_to, aid.stamp)
     return Verdict.WAITING
 
 
@@ -339,13 +343,20 @@ def open_record(aids, i):
 
 
 @njit
+def latest_of(state):
+    """Return the time of a checkpoint or the stamp of its last sample, whichever is later (ns)."""
+    return max(state.stamp, state.stamps.raw)
+
+
+@njit
 def forget(states, imu, aids, checkpoints, timeline):
     """Drop what no accepted message can change: all before the newest checkpoint that is older than the window."""
     t = timeline[0]
     keep = 0
-    while keep + 1 < t.checkpoint_count and checkpoints[keep + 1, FILTER].stamp < t.frontier - t.window:
+    oldest = t.frontier - t.window
+    while keep + 1 < t.checkpoint_count and latest_of(checkpoints[keep + 1, FILTER]) < oldest:
         keep += 1
-    if t.checkpoint_count == 0 or checkpoints[keep, FILTER].stamp >= t.frontier - t.window:
+    if t.checkpoint_count == 0 or latest_of(checkpoints[keep, FILTER]) >= oldest:
         return
     # The sample of the checkpoint itself stays: it is the predecessor of what may still be inserted after it.
     imu_gone = checkpoints[keep, FILTER].imu_next - 1
@@ -387,19 +398,27 @@ def raise_barrier(states, blank, timeline):
     t.aid_count = 0
     t.recorded = 0
     t.checkpoint_count = 0
-    t.barrier = t.frontier + 1
+    t.barrier = max(t.frontier, states[0].stamp) + 1
 
 
 @njit
-def take_final(aids, timeline, out, everything):
-    """Copy the records that can no longer change to ``out`` (long enough); return their number."""
+def take_final(states, aids, timeline, out, everything):
+    """Copy the records that can no longer change to ``out`` (long enough); return their number.
+
+    The state may be a little behind the frontier: what it has not judged is not final.
+    """
     t = timeline[0]
     count = 0
     while t.recorded < t.aid_count:
         aid = aids[t.recorded]
-        if not everything and (t.frontier == NEVER or aid.stamp >= t.frontier - t.window):
+        is_open = t.recorded >= states[0].aid_next or aid.stamp >= t.frontier - t.window
+        if not everything and (t.frontier == NEVER or is_open):
             break
-        if aid.verdict == Verdict.INACTIVE:
+        if t.recorded >= states[0].aid_next:
+            # What it was found to be before a rewind no longer counts.
+            open_record(aids, t.recorded)
+        is_unused = t.recorded >= states[0].aid_next and aid.stream >= SENSOR_STREAMS
+        if aid.verdict == Verdict.INACTIVE or is_unused:
             t.recorded += 1
             continue
         out[count].stamp = aid.stamp

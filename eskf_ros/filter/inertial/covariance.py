@@ -76,6 +76,9 @@ def acceleration_variance(covariance, rotation, force):
                 total += row[i] * row[j] * covariance[ATTITUDE + i, ATTITUDE + j]
     return 0.5 * total
 
+UNKNOWN_ATTITUDE = 1.0
+"""rad; standard deviation of an attitude that is as good as unknown."""
+
 
 @njit
 def apply_transition(columns, out, count, rotation, force, up, gravity_gradient, earth_rate, dt, coupling):
@@ -155,6 +158,29 @@ def propagate_noise(covariance, velocity_noise, attitude_noise, accel_walk, gyro
         covariance[t, t] += attitude_noise * dt
         covariance[a, a] += accel_walk * dt
         covariance[g, g] += gyro_walk * dt
+
+
+@njit
+def propagate_axis_noise(covariance, rotation, density, dt):
+    """Add ``dt`` s of process noise along the axes of the IMU, which ``rotation`` (body to map) turns into the map.
+
+    ``density``: spectral densities of velocity (m2/s3) along x, y, z, and of attitude (rad2/s) about them. An attitude
+    that is as good as unknown stays as it is: errors of more than a radian are beyond what is linear.
+    """
+    is_lost = covariance[6, 6] + covariance[7, 7] + covariance[8, 8] > UNKNOWN_ATTITUDE**2
+    for i in range(3):
+        for j in range(3):
+            velocity, attitude = 0.0, 0.0
+            for k in range(3):
+                product = rotation[i][k] * rotation[j][k]
+                velocity += density[k] * product
+                attitude += density[3 + k] * product
+            covariance[i, j] += velocity * dt * dt * dt / 3.0
+            covariance[i, 3 + j] += velocity * dt * dt / 2.0
+            covariance[3 + j, i] += velocity * dt * dt / 2.0
+            covariance[3 + i, 3 + j] += velocity * dt
+            if not is_lost:
+                covariance[6 + i, 6 + j] += attitude * dt
 
 
 @njit

@@ -22,6 +22,7 @@ import numpy as np
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.history.records import XX, YY, ZZ
+from eskf_ros.filter.inertial.sample_quality import is_hidden
 from eskf_ros.filter.state.enums import CONSTRAINT_INTERVAL, Stream, Verdict
 from eskf_ros.filter.state.error_state import SOURCES, VELOCITY
 from eskf_ros.filter.state.time import NEVER
@@ -139,7 +140,7 @@ def add_to_block(state, settings):
         for i in range(6):
             state.rest.block_sum[i] = 0.0
             state.rest.block_square_sum[i] = 0.0
-    if state.imu.interval > settings.imu_gap:
+    if is_hidden(state, settings):
         state.rest.block_broken = 1
     if state.rest.block_half_count == 0 and 2 * (end - state.stamp) < CONSTRAINT_INTERVAL:
         state.rest.block_half_count = state.rest.block_count

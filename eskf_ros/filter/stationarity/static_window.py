@@ -10,6 +10,7 @@ import numpy as np
 from eskf_ros.compiled import njit
 from eskf_ros.filter.history.records import XX, YY, ZZ
 from eskf_ros.filter.inertial.navigation_frame import local_up
+from eskf_ros.filter.inertial.sample_quality import is_hidden
 from eskf_ros.filter.state.error_state import GYRO_BIAS, SOURCES
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity.residual_motion import MOVING_SPEED
@@ -84,7 +85,7 @@ def update_static_window(state, settings):
     """Add the newest IMU sample to the static window; return its `Window`. The caller closes a full window."""
     if state.first_stamp == NEVER:
         state.first_stamp = state.stamp
-    if state.imu.interval > settings.imu_gap:
+    if is_hidden(state, settings):
         # A gap of the IMU may hide motion: no window spans it.
         state.window.start = NEVER
         state.window.still_samples = 0

@@ -1,0 +1,179 @@
+"""Samples that do not measure: what they cost, over exactly their time, and what a good sensor does not pay for."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter import predict
+from eskf_ros.filter.history.records import IMU
+from eskf_ros.filter.inertial.sample_quality import judge_sample
+from eskf_ros.filter.integrity.sample_report import sample_complaints
+from eskf_ros.filter.loop import take_sample
+from eskf_ros.filter.state.memory import allocate
+from support.kernels import make_settings, make_state, make_work
+
+Array = NDArray[np.float64]
+
+RATE = 100
+SETTINGS, WORK = make_settings(), make_work()
+SPEED = (15.0, 0.0, 0.0)
+FORCE_NOISE, RATE_NOISE = 0.05, 0.005
+"""m/s2, rad/s; standard deviation of a reading."""
+
+
+@njit
+def _run(state, samples, widened, speed, settings, work):
+    for k in range(len(samples)):
+        sample = samples[k]
+        judge_sample(state, sample, sample.stamp, settings)
+        widened[k] = state.quality.is_doubted
+        predict.propagate(state, sample.stamp, sample, sample.stamp, settings, work)
+        take_sample(state, sample, sample.stamp)
+        for i in range(3):
+            # Somebody else holds position and velocity; this is about what an interval adds.
+            state.velocity_map[i] = speed[i]
+
+
+def readings(seconds: float, seed: int = 1) -> Array:
+    """Six axes of a level robot (n, 6): slow turns, gentle acceleration, white noise."""
+    t = np.arange(round(seconds * RATE)) / RATE
+    rng = np.random.default_rng(seed)
+    force = FORCE_NOISE * rng.normal(size=(len(t), 3)) + (0.0, 0.0, 9.8)
+    rate = RATE_NOISE * rng.normal(size=(len(t), 3))
+    force[:, 1] += 1.5 * np.sin(0.5 * t)
+    rate[:, 2] += 0.25 * np.sin(0.5 * t)
+    return np.hstack([force, rate])
+
+
+def run(values: Array, speed: tuple[float, float, float] = SPEED, kept: Any = None) -> tuple[Any, NDArray[np.int64]]:
+    """The state after all samples, and which of the intervals were widened."""
+    samples = allocate(IMU, len(values))
+    samples["stamp"] = np.arange(1, len(values) + 1) * (1_000_000_000 // RATE)
+    samples["specific_force"], samples["angular_rate"] = values[:, :3], values[:, 3:]
+    if kept is not None:
+        samples = samples[kept]
+    state = make_state(velocity=speed)
+    widened = np.zeros(len(samples), np.int64)
+    _run(state, samples, widened, speed, SETTINGS, WORK)
+    return state, widened
+
+
+def attitude_std(state: Any) -> Array:
+    return np.asarray(np.sqrt(np.diag(state["covariance"])[6:9]))
+
+
+HOLE = slice(3000, 3160)
+
+
+def filled(kind: str) -> Array:
+    values = readings(40.0)
+    first, last = values[HOLE.start].copy(), values[HOLE.stop].copy()
+    share = np.linspace(0.0, 1.0, HOLE.stop - HOLE.start + 1)[:-1, None]
+    values[HOLE] = first if kind == "repeated" else (1.0 - share) * first + share * last
+    return values
+
+
+@pytest.mark.parametrize("kind", ["repeated", "bridged"])
+def test_a_filled_hole_costs_what_a_hole_costs(kind: str) -> None:
+    """Velocity and attitude are as uncertain after it as if the samples were missing, and no sample more is."""
+    state, widened = run(filled(kind))
+    kept = np.ones(4000, bool)
+    kept[HOLE.start + 1 : HOLE.stop] = False
+    missing, _ = run(readings(40.0), kept=kept)
+    clean, _ = run(readings(40.0))
+    np.testing.assert_allclose(attitude_std(state), attitude_std(missing), rtol=0.05)
+    assert (attitude_std(clean) < 0.03 * attitude_std(missing)).all()
+    begin, end = np.flatnonzero(widened)[[0, -1]]
+    assert HOLE.start < begin < HOLE.start + 0.15 * RATE
+    assert abs(end - HOLE.stop) <= 1
+    (sentence,) = sample_complaints(state)
+    assert sentence.startswith("1 holes in the IMU data are filled")
+
+
+def test_while_standing_a_repeated_sample_costs_nothing() -> None:
+    _, widened = run(filled("repeated"), speed=(0.0, 0.0, 0.0))
+    assert not widened.any()
+
+
+@pytest.mark.parametrize("quantum", [0.0, 0.3, 1.0, 3.0, 10.0])
+def test_a_coarse_sensor_that_works_costs_nothing(quantum: float) -> None:
+    """Steps of up to ten standard deviations of the noise: repeated readings are usual then. Half an hour each."""
+    values = readings(1800.0)
+    if quantum:
+        steps = quantum * np.repeat([FORCE_NOISE, RATE_NOISE], 3)
+        values = np.round(values / steps) * steps
+    state, widened = run(values)
+    assert not widened.any()
+    assert not sample_complaints(state)
+
+
+def test_a_simulation_without_noise_costs_nothing() -> None:
+    """Constant readings, straight lines and steps, again and again."""
+    t = np.arange(60_000) / RATE
+    values = np.zeros((len(t), 6))
+    values[:, 2] = 9.81
+    values[:, 5] = 0.2 * np.clip(np.sin(0.2 * t) * 3.0, -1.0, 1.0)
+    values[:, 1] = 15.0 * values[:, 5]
+    values[:, 0] = np.where(t % 20.0 < 2.0, 1.0, 0.0)
+    state, widened = run(values)
+    assert not widened.any()
+    assert not sample_complaints(state)
+
+
+def test_a_clipped_gyro_opens_the_heading_alone() -> None:
+    values = readings(60.0)
+    values[1000:, 5] = np.clip(2.0 * values[1000:, 5], -0.3, 0.3)
+    state, widened = run(values)
+    clipped = np.abs(values[:, 5]) == 0.3
+    # From the seventh equal sample of a run on, and after it nothing.
+    late = np.logical_and.reduce([np.roll(clipped, k) for k in range(7)])
+    assert widened[late & (np.arange(len(values)) > 1000)].all()
+    assert not widened[~clipped].any()
+    std = attitude_std(state)
+    assert std[2] > 0.2
+    assert (std[:2] < 0.02).all()
+    (sentence,) = sample_complaints(state)
+    assert sentence.startswith("the z gyro is clipped at")
+    assert "0.30 rad/s" in sentence
+
+
+def test_a_stuck_axis_opens_its_own_direction() -> None:
+    values = readings(40.0)
+    values[2000:3000, 0] = values[2000, 0]
+    state, widened = run(values)
+    assert widened[2060:3000].all()
+    assert not widened[:2040].any()
+    assert not widened[3001:].any()
+    (sentence,) = sample_complaints(state)
+    assert sentence.startswith("the x accelerometer was stuck at")
+
+
+def test_a_shock_opens_what_it_may_have_turned() -> None:
+    """0.1 s of 100 m/s2 and 8 rad/s along one direction: the error is within two sigma of each axis."""
+    values = readings(40.0)
+    direction = np.array([0.6, -0.64, 0.48])
+    values[3000:3010, :3] += 100.0 * direction
+    values[3000:3010, 3:] += 8.0 * direction
+    state, widened = run(values)
+    clean, _ = run(readings(40.0))
+    assert widened[3000:3010].all()
+    assert not widened[:3000].any()
+    assert not widened[3011:].any()
+    added = np.sqrt(attitude_std(state) ** 2 - attitude_std(clean) ** 2)
+    np.testing.assert_array_less(0.5 * 0.8 * np.abs(direction), added)
+    assert math.hypot(*added) < 2.0
+
+
+def test_vibration_that_sets_in_is_no_shock_for_long() -> None:
+    """An engine is switched on: 15 m/s2 and 1.5 rad/s from sample to sample cost the first tenths of a second."""
+    values = readings(60.0)
+    rng = np.random.default_rng(3)
+    values[3000:] += np.repeat([15.0, 1.5], 3) * rng.normal(size=(3000, 6))
+    _, widened = run(values)
+    assert np.flatnonzero(widened).max() < 3200
