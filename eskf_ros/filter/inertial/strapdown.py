@@ -40,7 +40,8 @@ IMU_READINGS = np.dtype(
 )
 """The last raw IMU reading (m/s2, rad/s), its time, the interval (s) that it ended, and the reading before.
 
-``stamp`` (ns) is free of jitter (`stamps`). ``smooth_force``, ``smooth_rate``: readings without vibration, averaged over about `SMOOTHING_TIME`.
+``stamp`` (ns) is free of jitter (`stamps`). ``smooth_force``, ``smooth_rate``: readings without vibration, averaged
+over about `SMOOTHING_TIME`.
 """
 
 SMOOTHING_TIME = 0.1
