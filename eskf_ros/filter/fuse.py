@@ -35,7 +35,7 @@ from eskf_ros.filter.output.local_odometry import note_jump
 from eskf_ros.filter.state.augmented_states import update_error_size
 from eskf_ros.filter.state.enums import SENSOR_STREAMS, Stream, Verdict
 from eskf_ros.filter.state.lanes import FILTER
-from eskf_ros.filter.stationarity.detector import update_rest_evidence, watch_wheels
+from eskf_ros.filter.stationarity.detector import update_rest_evidence, watch_rest, watch_wheels
 from eskf_ros.filter.stationarity.static_window import update_evidence_from_fix, update_evidence_from_velocity
 
 MEASUREMENTS = (
@@ -114,6 +114,8 @@ def offer(states, aid, heading_before, settings, work):
         mag.note_field(state, aid, mag.FIELD)
     elif aid.stream == Stream.WHEEL:
         watch_wheels(state, aid)
+    elif aid.stream == Stream.ZUPT:
+        watch_rest(state, aid.verdict)
 
 
 @njit

@@ -47,6 +47,7 @@ from eskf_ros.filter.state.streams import STREAMS
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity.detector import REST
 from eskf_ros.filter.stationarity.residual_motion import RESIDUAL_MOTION
+from eskf_ros.filter.stationarity.seen_motion import SEEN_MOTION
 from eskf_ros.filter.stationarity.static_window import STATIC_WINDOW
 from eskf_ros.filter.tight.epoch_least_squares import LARGEST_EPOCH
 from eskf_ros.filter.tight.receiver_clock import TIGHT
@@ -91,6 +92,7 @@ STATE = np.dtype(
         ("window", STATIC_WINDOW),
         ("residual", RESIDUAL_MOTION),
         ("rest", REST),
+        ("seen", SEEN_MOTION),
         ("levelling", LEVELLING),
         ("imu_monitor", IMU_MONITOR),
         ("heading_monitor", HEADING_MONITOR),
@@ -253,11 +255,12 @@ _NEVER = {
         "block_end",
         "moving_stamp",
         "resting_stamp",
-        "quiet_fix_stamp",
+        "doubt_stamp",
         "quiet_pressure_stamp",
         "wheel_stamp",
         "slip_stamp",
     ),
+    "seen": ("stamp", "origin_stamp", "turn_stamp"),
     "streams": (
         "last_stamp",
         "fused_stamp",

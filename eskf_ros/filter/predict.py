@@ -36,8 +36,8 @@ WANDER_TIME = 1.0
 def step(state, quality, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
     """Propagate one lane by ``dt`` s between two raw IMU readings (m/s2, rad/s; IMU axes).
 
-    ``quality`` says which axes are doubted (`inertial.sample_quality`). ``gap`` (s) is the length of the hole in the IMU
-    data that is being bridged, 0 for none.
+    ``quality`` says which axes are doubted (`inertial.sample_quality`). ``gap`` (s) is the length of the hole in
+    the IMU data that is being bridged, 0 for none.
     """
     # With an unknown heading the direction of the measured acceleration on the map is unknown: it is not integrated.
     coupling = 0.0 if state.heading_known == 0 else 1.0

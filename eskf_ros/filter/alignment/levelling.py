@@ -14,6 +14,7 @@ from eskf_ros.filter.inertial.navigation_frame import heading_of, local_up, rese
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_CAPACITY, ERROR_SIZE, GYRO_BIAS
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity.residual_motion import can_be_bias, is_moving, note_sway
+from eskf_ros.filter.stationarity.seen_motion import unseen_turn
 from eskf_ros.filter.stationarity.static_window import Window
 from eskf_ros.geodesy.earth import EARTH_RATE, STANDARD_GRAVITY
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix, wrapped
@@ -238,6 +239,8 @@ def update_gyro_bias_at_rest(state, prior_bias, prior, mean_rate, up, duration, 
     elif state.heading_known == 1:
         known = (earth[0], earth[1], earth[2])
         horizontal_variance = noise + horizontal_square * settings.initial_heading_std**2
+    # A turn that a dual antenna does not exclude may be what the gyro reads.
+    vertical_variance += unseen_turn(state)
     vertical_gain = prior / (prior + vertical_variance) if is_rest and prior > 0.0 else 0.0
     horizontal_gain = prior / (prior + horizontal_variance) if is_rest and prior > 0.0 else 0.0
     mean_map = rotate(

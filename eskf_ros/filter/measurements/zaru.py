@@ -19,7 +19,7 @@ from eskf_ros.filter.measurements.row import Row
 from eskf_ros.filter.measurements.zupt import CONSTRAINT_GATE_PROBABILITY, is_enabled
 from eskf_ros.filter.state.enums import CONSTRAINT_INTERVAL, Stream
 from eskf_ros.filter.state.error_state import ATTITUDE, GYRO_BIAS
-from eskf_ros.filter.stationarity.detector import is_resting, mean_rate
+from eskf_ros.filter.stationarity.detector import is_resting, is_turning, mean_rate
 from eskf_ros.geodesy.rotation import cross, rotate_back, to_matrix
 
 SIZE = 3
@@ -53,8 +53,11 @@ def remaining_share(state, density):
 
 @njit
 def linearize(state, settings, work):
-    """Write innovation, Jacobian and noise to ``work``; return the number of scalars, 0 unless the robot is at rest."""
-    if not is_resting(state, settings):
+    """Write innovation, Jacobian and noise to ``work``; return the number of scalars, 0 unless the robot is at rest.
+
+    Nor if it may be turning more slowly than the gate, with the noise of the parameters, would notice.
+    """
+    if not is_resting(state, settings) or is_turning(state):
         return 0
     clear(work)
     measured, predicted = mean_rate(state), predict(state)

@@ -2,9 +2,9 @@
 
 At constant velocity an IMU reads what it reads at rest. Quiet readings are therefore necessary but not sufficient:
 
-- Sensors that see motion decide if there are any: GNSS velocity, wheels, body velocity, the displacement of fixes since
-  the IMU became quiet. Motion seen by any of them is a veto (a change of the air pressure is motion, too), and rest
-  seen by one of them is sufficient.
+- Sensors that see motion decide if there are any: wheels, and velocities and fixes collected until they would show a
+  creep (`seen_motion`). Motion seen by any of them is a veto (a change of the air pressure is motion, too), and rest
+  seen by one of them is sufficient, unless a dual antenna cannot exclude a turn yet.
 - If no such sensor has reported for `EVIDENCE_LASTS` (a tunnel), the readings must be as quiet as they were when a
   sensor saw rest. Unless the readings of this robot in motion were always plainly less quiet, the estimated velocity
   must be near zero, too. Without such sensors one motion remains undetectable: about a decimetre per second at constant
@@ -24,11 +24,20 @@ from eskf_ros.compiled import njit
 from eskf_ros.filter.history.records import XX, YY, ZZ
 from eskf_ros.filter.inertial.sample_quality import is_hidden
 from eskf_ros.filter.state.enums import CONSTRAINT_INTERVAL, Stream, Verdict
-from eskf_ros.filter.state.error_state import SOURCES, VELOCITY
+from eskf_ros.filter.state.error_state import GYRO_BIAS, VELOCITY
 from eskf_ros.filter.state.time import NEVER
+from eskf_ros.filter.stationarity.seen_motion import (
+    BODY_EYE,
+    Seen,
+    has_sight,
+    open_motion,
+    see_fix,
+    see_velocity,
+    see_yaw,
+)
 from eskf_ros.filter.stationarity.static_window import update_motion
 from eskf_ros.geodesy.earth import geodetic_to_ecef
-from eskf_ros.geodesy.rotation import dot
+from eskf_ros.geodesy.rotation import dot, rotate_back, to_matrix
 
 REST = np.dtype(
     [
@@ -39,14 +48,15 @@ REST = np.dtype(
         ("block_square_sum", "f8", (6,)),
         ("block_half_count", "i8"),
         ("block_half_sum", "f8", (6,)),
+        ("run_blocks", "i8"),
+        ("run_mean", "f8", (6,)),
+        ("run_scatter", "f8", (6,)),
         ("moving_stamp", "i8"),
         ("resting_stamp", "i8"),
+        ("doubt_stamp", "i8"),
         ("moving_activity", "f8"),
         ("resting_activity", "f8"),
         ("quiet", "i8"),
-        ("quiet_fix_stamp", "i8", (SOURCES,)),
-        ("quiet_fix_variance", "f8", (SOURCES,)),
-        ("quiet_fix_ecef", "f8", (SOURCES, 3)),
         ("quiet_pressure_stamp", "i8"),
         ("quiet_pressure", "f8"),
         ("wheel_stamp", "i8"),
@@ -59,10 +69,13 @@ REST = np.dtype(
 - ``block_end``, ``block_broken``: the grid point that ends the block (ns), and whether a sample is missing in it.
 - ``block_count``, ``block_sum``, ``block_square_sum``: samples, sums and sums of squares (m/s2, rad/s).
 - ``block_half_count``, ``block_half_sum``: the same for the first half of the block.
+- ``run_blocks``, ``run_mean``, ``run_scatter``: quiet blocks in a row with the same mean readings, this mean, and the
+  variance of the means of single blocks about it.
 - ``moving_stamp``, ``resting_stamp``: when another sensor last saw motion and rest (ns).
+- ``doubt_stamp``: when the dual antenna could last not exclude a turn (ns).
 - ``moving_activity``, ``resting_activity``: learnt activity of the IMU (see `unrest`) in motion and at rest.
 - ``quiet``: whether the IMU was quiet in the last block.
-- ``quiet_fix_*``, ``quiet_pressure*``: fix and pressure at the time when the IMU became quiet.
+- ``quiet_pressure*``: pressure at the time when the IMU became quiet.
 - ``wheel_stamp``, ``slip_stamp``: the last message of the wheels, and the last one that the gate rejected (ns).
 """
 
@@ -71,6 +84,18 @@ FEWEST_SAMPLES = 3
 
 STEADY_SIGMAS = 4.0
 """Standard deviations by which the means of the two halves of a block may differ at rest."""
+
+CHANGE_SIGMAS = 4.0
+"""Standard deviations by which the mean of a quiet block must differ from those before it to show a start or a stop."""
+
+LEAST_CHANGE = (5e-3, 2e-4)
+"""m/s2, rad/s; such means scatter by this much, at least: settling springs, wind, drifting biases."""
+
+FEWEST_BLOCKS = 3
+"""Quiet blocks, at least, that tell how much their means scatter."""
+
+RUN_MEMORY = 10
+"""Blocks over which their mean and its scatter are taken."""
 
 EVIDENCE_LASTS = 1_500_000_000
 """ns; what a sensor saw, rest or motion, counts for this long."""
@@ -81,20 +106,8 @@ MOTION_SIGMAS = 4.0
 LEAST_MOTION = 0.1
 """m/s; a smaller velocity does not prove motion."""
 
-REST_SIGMAS = 3.0
-"""A velocity or a displacement indicates rest only if it is below its standard deviation times this factor."""
-
-WORST_REST_STD = 0.3
-"""m/s; a velocity with a larger standard deviation does not indicate rest."""
-
-DISPLACEMENT_SIGMAS = 5.0
-"""Standard deviations that a displacement of fixes, or a change of pressure, must exceed to prove motion."""
-
-WORST_DISPLACEMENT_STD = 0.1
-"""m/s; a displacement indicates rest only if its standard deviation over the elapsed time is below this."""
-
-WAY_LASTS = 3_000_000_000
-"""ns; while the IMU is not quiet, the displacement is measured from a fix that is at most this old."""
+PRESSURE_SIGMAS = 5.0
+"""Standard deviations that a change of pressure must exceed to prove motion."""
 
 STANDING_SPEED = 0.01
 """m/s; wheels stand below this speed: they do not scatter around zero."""
@@ -220,16 +233,73 @@ def is_steady(state, settings):
 
 
 @njit
+def has_changed(state):
+    """Say whether the mean readings of the block differ from those of the quiet blocks before it: a start, or a stop.
+
+    How much they scatter is learnt, so that neither the noise nor the sway that the parameters allow hides a creep.
+    """
+    if state.rest.run_blocks < FEWEST_BLOCKS:
+        return False
+    for i in range(6):
+        change = state.rest.block_sum[i] / state.rest.block_count - state.rest.run_mean[i]
+        least = LEAST_CHANGE[0] if i < 3 else LEAST_CHANGE[1]
+        if change * change > CHANGE_SIGMAS**2 * (state.rest.run_scatter[i] + least * least):
+            return True
+    return False
+
+
+@njit
+def add_to_run(state, is_quiet):
+    """Add the block to the run of quiet blocks; one that is loud, or changed, begins another."""
+    if not is_quiet:
+        state.rest.run_blocks = 0
+        return
+    if has_changed(state):
+        state.rest.run_blocks = 0
+    state.rest.run_blocks += 1
+    share = 1.0 / min(state.rest.run_blocks, RUN_MEMORY)
+    for i in range(6):
+        change = state.rest.block_sum[i] / state.rest.block_count - state.rest.run_mean[i]
+        if state.rest.run_blocks == 1:
+            state.rest.run_mean[i] += change
+            state.rest.run_scatter[i] = 0.0
+        else:
+            state.rest.run_mean[i] += share * change
+            state.rest.run_scatter[i] += share * ((1.0 - share) * change * change - state.rest.run_scatter[i])
+
+
+@njit
+def is_turning(state):
+    """Say whether the mean rate of the block cannot be the gyro bias as it is known: a turn, however slow.
+
+    The noise of the mean is that of these readings, which may be far below the one that the parameters allow.
+    """
+    n = state.rest.block_count
+    earth = rotate_back(to_matrix(state.attitude), state.frame.earth_rate_map)
+    rate = mean_rate(state)
+    for i in range(3):
+        variance = max(state.rest.block_square_sum[3 + i] / n - rate[i] * rate[i], 0.0) / n + LEAST_CHANGE[1] ** 2
+        excess = rate[i] - state.gyro_bias[i] - earth[i]
+        if excess * excess > CHANGE_SIGMAS**2 * (variance + state.covariance[GYRO_BIAS + i, GYRO_BIAS + i]):
+            return True
+    return False
+
+
+@njit
 def learn_from_block(state, settings):
     """Learn at the end of a block how quiet seen rest and motion are, and note where the robot became quiet."""
-    level = unrest(state, settings) if is_complete(state) and is_steady(state, settings) else -1.0
+    is_quiet = is_complete(state) and is_steady(state, settings)
+    level = unrest(state, settings) if is_quiet else -1.0
+    if level < 0.0 or has_changed(state):
+        # Starts and stops are felt before they are seen.
+        state.rest.resting_stamp = NEVER
+        open_motion(state)
+    add_to_run(state, level >= 0.0)
     moved = state.rest.moving_stamp > state.rest.block_end - CONSTRAINT_INTERVAL
     rested = state.rest.resting_stamp > state.rest.block_end - CONSTRAINT_INTERVAL
     was_quiet = state.rest.quiet
     state.rest.quiet = 1 if level >= 0.0 and not moved else 0
     if state.rest.quiet != was_quiet:
-        for source in range(SOURCES):
-            state.rest.quiet_fix_stamp[source] = NEVER
         state.rest.quiet_pressure_stamp = NEVER
     if level < 0.0:
         return
@@ -248,13 +318,15 @@ def learn_from_block(state, settings):
 @njit
 def is_resting(state, settings):
     """Say whether the robot has been stationary since the last grid point; the state is at a grid point."""
-    if not (has_block(state) and is_steady(state, settings)):
+    if not (has_block(state) and is_steady(state, settings)) or (has_sight(state) and has_changed(state)):
         return False
     level = unrest(state, settings)
-    if level < 0.0 or state.stamp - state.rest.moving_stamp <= EVIDENCE_LASTS:
+    if level < 0.0 or state.stamp - max(state.rest.moving_stamp, state.rest.doubt_stamp) <= EVIDENCE_LASTS:
         return False
     if state.stamp - state.rest.resting_stamp <= EVIDENCE_LASTS:
         return True
+    if has_sight(state):
+        return False
     rest, motion = state.rest.resting_activity, state.rest.moving_activity
     if rest == 0.0 or level > AS_QUIET * rest:
         return False
@@ -274,56 +346,45 @@ def update_rest_evidence(state, aid):
     """
     p = aid.payload
     if aid.stream == Stream.GNSS_POSITION:
-        note_displacement(state, aid)
+        fix = geodetic_to_ecef(p[0], p[1], p[2])
+        note_seen(state, aid.stamp, see_fix(state, aid.source, aid.stamp, fix, p[0], p[1], (p[XX], p[YY], p[ZZ])))
     elif aid.stream == Stream.GNSS_VELOCITY:
-        weigh_speed(
-            state, aid.stamp, math.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2), math.sqrt(max(p[XX], p[YY], p[ZZ])), True
-        )
+        velocity = (p[0], p[1], p[2])
+        note_seen(state, aid.stamp, see_velocity(state, aid.source, aid.stamp, velocity, (p[XX], p[YY], p[ZZ])))
+    elif aid.stream == Stream.HEADING:
+        if aid.source == 0 and p[XX] > 0.0:
+            seen = see_yaw(state, aid.stamp, p[0], p[XX])
+            if seen == Seen.MOTION:
+                state.rest.moving_stamp = aid.stamp
+            elif seen == Seen.NOTHING:
+                state.rest.doubt_stamp = aid.stamp
     elif aid.stream == Stream.BODY_VELOCITY:
         speed, std = math.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2), math.sqrt(max(p[XX], p[YY], p[ZZ]))
-        weigh_speed(state, aid.stamp, speed, std, min(p[XX], p[YY], p[ZZ]) > 0.0)
-        return update_motion(state, speed - REST_SIGMAS * std, aid.stamp, aid.stamp)
+        if min(p[XX], p[YY], p[ZZ]) > 0.0:
+            velocity = (p[0], p[1], p[2])
+            note_seen(state, aid.stamp, see_velocity(state, BODY_EYE, aid.stamp, velocity, (p[XX], p[YY], p[ZZ])))
+        elif speed > max(MOTION_SIGMAS * std, LEAST_MOTION):
+            state.rest.moving_stamp = aid.stamp
+        return update_motion(state, speed - MOTION_SIGMAS * std, aid.stamp, aid.stamp)
     elif aid.stream == Stream.WHEEL:
         if abs(p[0]) < STANDING_SPEED and abs(p[1]) < STANDING_YAW_RATE:
             if p[XX] > 0.0:
                 state.rest.resting_stamp = aid.stamp
         else:
             state.rest.moving_stamp = aid.stamp
-            return update_motion(state, abs(p[0]) - REST_SIGMAS * math.sqrt(max(p[XX], 0.0)), aid.stamp, aid.stamp)
+            return update_motion(state, abs(p[0]) - MOTION_SIGMAS * math.sqrt(max(p[XX], 0.0)), aid.stamp, aid.stamp)
     elif aid.stream == Stream.BARO:
         note_pressure(state, aid)
     return False
 
 
 @njit
-def weigh_speed(state, stamp, speed, std, is_whole):
-    """Take a speed (m/s) as evidence of motion, or of rest if it ``is_whole``: measured along all three axes."""
-    if speed > max(MOTION_SIGMAS * std, LEAST_MOTION):
+def note_seen(state, stamp, seen):
+    """Take what a sensor sees (`Seen`) as evidence of motion or of rest."""
+    if seen == Seen.MOTION:
         state.rest.moving_stamp = stamp
-    elif is_whole and speed < REST_SIGMAS * std and std < WORST_REST_STD:
+    elif seen == Seen.REST:
         state.rest.resting_stamp = stamp
-
-
-@njit
-def note_displacement(state, aid):
-    """Compare a fix with the one at which the IMU became quiet or, while it is not, with one a few seconds old."""
-    fix = geodetic_to_ecef(aid.payload[0], aid.payload[1], aid.payload[2])
-    variance = max(aid.payload[XX], aid.payload[YY], aid.payload[ZZ])
-    source = aid.source
-    age = aid.stamp - state.rest.quiet_fix_stamp[source]
-    if state.rest.quiet_fix_stamp[source] == NEVER or (state.rest.quiet == 0 and age > WAY_LASTS):
-        state.rest.quiet_fix_stamp[source] = aid.stamp
-        state.rest.quiet_fix_variance[source] = variance
-        for i in range(3):
-            state.rest.quiet_fix_ecef[source, i] = fix[i]
-        return
-    start = state.rest.quiet_fix_ecef[source]
-    way = (fix[0] - start[0], fix[1] - start[1], fix[2] - start[2])
-    distance, std = math.sqrt(dot(way, way)), math.sqrt(variance + state.rest.quiet_fix_variance[source])
-    if distance > DISPLACEMENT_SIGMAS * std:
-        state.rest.moving_stamp = aid.stamp
-    elif state.rest.quiet == 1 and distance < REST_SIGMAS * std and std < WORST_DISPLACEMENT_STD * age * 1e-9:
-        state.rest.resting_stamp = aid.stamp
 
 
 @njit
@@ -332,8 +393,16 @@ def note_pressure(state, aid):
     if state.rest.quiet == 0 or aid.stamp - state.rest.quiet_pressure_stamp > PRESSURE_LASTS:
         state.rest.quiet_pressure_stamp = aid.stamp
         state.rest.quiet_pressure = aid.payload[0]
-    elif abs(aid.payload[0] - state.rest.quiet_pressure) > DISPLACEMENT_SIGMAS * math.sqrt(2.0 * aid.payload[XX]):
+    elif abs(aid.payload[0] - state.rest.quiet_pressure) > PRESSURE_SIGMAS * math.sqrt(2.0 * aid.payload[XX]):
         state.rest.moving_stamp = aid.stamp
+
+
+@njit
+def watch_rest(state, verdict):
+    """Forget that rest was seen if the gate rejects it: the IMU has felt a start that others cannot see so soon."""
+    if verdict == Verdict.GATE:
+        state.rest.resting_stamp = NEVER
+        open_motion(state)
 
 
 @njit

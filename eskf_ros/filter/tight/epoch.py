@@ -34,7 +34,8 @@ from eskf_ros.filter.output.local_odometry import note_jump
 from eskf_ros.filter.state.enums import Stream, Verdict
 from eskf_ros.filter.state.error_state import POSITION, VELOCITY
 from eskf_ros.filter.state.lanes import FILTER, HUMBLE, is_running
-from eskf_ros.filter.stationarity.detector import weigh_speed
+from eskf_ros.filter.stationarity.detector import note_seen
+from eskf_ros.filter.stationarity.seen_motion import see_velocity
 from eskf_ros.filter.stationarity.static_window import (
     VELOCITY_SIGMAS,
     update_evidence_from_place,
@@ -225,7 +226,8 @@ def note_solution(state, stamp, which, settings, work):
         speed = math.sqrt(dot(measured, measured))
         if update_motion(state, speed - VELOCITY_SIGMAS * std, stamp, stamp):
             reset_level_to_moving(state, settings)
-        weigh_speed(state, stamp, speed, std, True)
+        variances = (work.normal[0, 0], work.normal[1, 1], work.normal[2, 2])
+        note_seen(state, stamp, see_velocity(state, 0, stamp, measured, variances))
     if state.heading_known == 0:
         for i in range(3):
             for j in range(3):
