@@ -196,6 +196,13 @@ def mean_rate(state):
 
 
 @njit
+def variance_of_mean(state, i):
+    """Return the variance of the mean of the block along axis ``i`` (0 to 2 force, 3 to 5 rate) if its noise is white."""
+    n, mean = state.rest.block_count, state.rest.block_sum[i] / state.rest.block_count
+    return max(state.rest.block_square_sum[i] / n - mean * mean, 0.0) / n
+
+
+@njit
 def unrest(state, settings):
     """Return the activity: the sum of the six variances over their limits at rest; -1 if one is above its limit."""
     total = 0.0
@@ -236,14 +243,17 @@ def is_steady(state, settings):
 def has_changed(state):
     """Say whether the mean readings of the block differ from those of the quiet blocks before it: a start, or a stop.
 
-    How much they scatter is learnt, so that neither the noise nor the sway that the parameters allow hides a creep.
+    How much they scatter is learnt, so that neither the noise nor the sway that the parameters allow hides a creep;
+    until then it is what white noise, of which the readings would consist, leaves in a mean.
     """
-    if state.rest.run_blocks < FEWEST_BLOCKS:
+    blocks = state.rest.run_blocks
+    if blocks == 0:
         return False
     for i in range(6):
         change = state.rest.block_sum[i] / state.rest.block_count - state.rest.run_mean[i]
         least = LEAST_CHANGE[0] if i < 3 else LEAST_CHANGE[1]
-        if change * change > CHANGE_SIGMAS**2 * (state.rest.run_scatter[i] + least * least):
+        scatter = state.rest.run_scatter[i] if blocks >= FEWEST_BLOCKS else 2.0 * variance_of_mean(state, i)
+        if change * change > CHANGE_SIGMAS**2 * (scatter + least * least):
             return True
     return False
 
@@ -274,11 +284,10 @@ def is_turning(state):
 
     The noise of the mean is that of these readings, which may be far below the one that the parameters allow.
     """
-    n = state.rest.block_count
     earth = rotate_back(to_matrix(state.attitude), state.frame.earth_rate_map)
     rate = mean_rate(state)
     for i in range(3):
-        variance = max(state.rest.block_square_sum[3 + i] / n - rate[i] * rate[i], 0.0) / n + LEAST_CHANGE[1] ** 2
+        variance = variance_of_mean(state, 3 + i) + LEAST_CHANGE[1] ** 2
         excess = rate[i] - state.gyro_bias[i] - earth[i]
         if excess * excess > CHANGE_SIGMAS**2 * (variance + state.covariance[GYRO_BIAS + i, GYRO_BIAS + i]):
             return True
