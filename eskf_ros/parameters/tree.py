@@ -482,7 +482,7 @@ class Alignment:
         "direction (a multirotor, a vessel in the current, a walker with a hand-held IMU).",
     )
     course_min_speed: float = parameter(
-        1.5,
+        0.2,
         "m/s",
         "Horizontal speed above which the course over ground tells the heading.",
         above=0.0,

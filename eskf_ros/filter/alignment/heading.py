@@ -18,7 +18,8 @@ from eskf_ros.filter.inertial.navigation_frame import (
 from eskf_ros.filter.measurements.gnss_position import position_of_fix
 from eskf_ros.filter.measurements.jacobians import set_east_north_up_covariance
 from eskf_ros.filter.state.enums import Stream
-from eskf_ros.filter.state.error_state import ATTITUDE, VELOCITY
+from eskf_ros.filter.state.error_state import ATTITUDE
+from eskf_ros.filter.state.time import NEVER
 from eskf_ros.geodesy.earth import east_north_up_to_ecef, geodetic_to_ecef
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix, wrapped
 
@@ -29,12 +30,20 @@ COURSE_MAX_TURN_RATE = 0.2
 """rad/s; the course over ground gives the heading only if the robot turns more slowly."""
 
 CERTAIN = 3.0
-"""Standard deviations within which search and course must agree, and by which forward must differ from reverse."""
+"""Standard deviations by which forward must differ from reverse."""
+
+AGREEMENT = 1.5
+"""Standard deviations of the search within which it must agree with the course. A craft that is set off by a current
+disagrees by as many of them as it crabs: the tighter they must agree, the more certainly it is told apart.
+"""
+
+COURSE_PATIENCE = 20_000_000_000
+"""ns; for this long search and course must agree. Many a search has found the heading by itself meanwhile, better."""
 
 LEAST_LENGTH = 0.5
 """Length of the found (cos, sin) along the course, at least; 1 if the model holds."""
 
-COURSE_SEARCH_STD = 0.35
+COURSE_SEARCH_STD = 0.175
 """rad; standard deviation of the direction found by the search above which the course is not believed."""
 
 
@@ -111,23 +120,38 @@ def search_with(state, first, measured, lever, gate, settings, work):
 
 @njit
 def align_to_course(state, settings):
-    """Set the unknown heading to the course over ground, if that is certain and steady and the search confirms it.
+    """Set the unknown heading to the course over ground, if the search has confirmed it for `COURSE_PATIENCE`.
 
-    Accelerations tell forward from reverse, and side slip from straight travel, long before they tell the heading as
-    accurately as the course does.
+    Accelerations tell forward from reverse, and side slip from straight travel, before they tell the heading as
+    accurately as the course does. But they tell the side slip no better than they tell the heading: what crabs may
+    agree with its course by chance, and the standard deviation that is set is therefore not below that of the search.
     """
-    v = state.velocity_map
+    heading, std = course_confirmed(state, settings)
+    if std == math.inf:
+        state.search.course_since = NEVER
+    elif state.search.course_since == NEVER:
+        state.search.course_since = state.stamp
+    elif state.stamp - state.search.course_since >= COURSE_PATIENCE:
+        reset_heading(state, heading, std, settings)
+        state.heading_known = 1
+
+
+@njit
+def course_confirmed(state, settings):
+    """Return the heading of a robot that travels along its x axis and its standard deviation (rad), infinite if unsure.
+
+    The course must be certain and steady, and agree with the search. The velocity is that of the search, which knows
+    the accelerations.
+    """
+    v = (state.search.estimate[2], state.search.estimate[3])
     speed = math.sqrt(v[0] ** 2 + v[1] ** 2)
-    if speed < settings.course_min_speed or state.search.started == 0:
-        return
+    if state.search.started == 0 or speed < settings.course_min_speed:
+        return 0.0, math.inf
     along = (v[0] / speed, v[1] / speed)
-    covariance = state.covariance
-    pxx = covariance[VELOCITY, VELOCITY]
-    pxy = covariance[VELOCITY, VELOCITY + 1]
-    pyy = covariance[VELOCITY + 1, VELOCITY + 1]
+    covariance = state.search.covariance
+    pxx, pxy, pyy = covariance[2, 2], covariance[2, 3], covariance[3, 3]
     along_variance = along[0] ** 2 * pxx + 2.0 * along[0] * along[1] * pxy + along[1] ** 2 * pyy
     across_variance = along[1] ** 2 * pxx - 2.0 * along[0] * along[1] * pxy + along[0] ** 2 * pyy
-    course_std = math.sqrt(max(across_variance, 0.0) / speed**2 + settings.course_std**2)
     up = local_up(state)
     turn_rate = dot(up, rotate(to_matrix(state.attitude), body_rate(state, to_matrix(state.attitude))))
     if (
@@ -135,7 +159,7 @@ def align_to_course(state, settings):
         or speed**2 < 9.0 * along_variance
         or abs(turn_rate) > COURSE_MAX_TURN_RATE
     ):
-        return
+        return 0.0, math.inf
     heading = math.atan2(v[1], v[0])
     turn = heading - heading_of(state, settings)
     cosine, sine = math.cos(turn), math.sin(turn)
@@ -145,13 +169,12 @@ def align_to_course(state, settings):
     if (
         abs(ahead) < max(CERTAIN * ahead_std, LEAST_LENGTH)
         or aside_std > COURSE_SEARCH_STD * abs(ahead)
-        or abs(aside) > CERTAIN * math.hypot(aside_std, course_std * abs(ahead))
+        or abs(aside) > AGREEMENT * aside_std
     ):
-        return
+        return 0.0, math.inf
     if ahead < 0.0:
         heading += math.pi
-    reset_heading(state, heading, course_std, settings)
-    state.heading_known = 1
+    return heading, math.sqrt(across_variance / speed**2 + settings.course_std**2 + (aside_std / ahead) ** 2)
 
 
 @njit

@@ -14,8 +14,8 @@ from eskf_ros.filter.measurements.jacobians import vehicle_axes
 from eskf_ros.filter.measurements.wheel import repeated
 from eskf_ros.geodesy.rotation import cross, rotate, to_matrix
 
-LEAST_SPEED = 0.7
-"""m/s; slower wheels tell no direction: pulse counters read zero until the vehicle moves at 0.5 m/s."""
+LEAST_SPEED = 0.15
+"""m/s; slower wheels tell no direction: they scatter, and pulse counters that read zero may be moving."""
 
 SIDE_SLIP_TIME = 10.0
 """s; time for which the course differs from the heading by the same angle."""

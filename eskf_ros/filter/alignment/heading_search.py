@@ -22,6 +22,7 @@ import numpy as np
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, GYRO_BIAS
+from eskf_ros.filter.state.time import NEVER
 from eskf_ros.geodesy.earth import STANDARD_GRAVITY
 from eskf_ros.geodesy.rotation import rotate
 
@@ -34,11 +35,12 @@ SEARCH = np.dtype(
         ("estimate", "f8", (SEARCH_SIZE,)),
         ("covariance", "f8", (SEARCH_SIZE, SEARCH_SIZE)),
         ("age", "f8"),
+        ("course_since", "i8"),
     ],
     align=True,
 )
-"""The search for the heading: whether it has started, its states and their covariance, and the seconds since the last
-level (``age``).
+"""The search for the heading: whether it has started, its states and their covariance, the seconds since the last
+level (``age``), and since when the course over ground agrees with it (ns).
 """
 
 COSINE = 4
@@ -50,8 +52,8 @@ TILT = 6
 BIAS = 8
 """Index of the horizontal accelerometer bias, along x and y of base_link turned into the level plane."""
 
-START_VELOCITY_STD = 30.0
-"""m/s per axis; prior of the velocity at the first fix."""
+START_VELOCITY_STD = 200.0
+"""m/s per axis; prior of the velocity at the first fix, which may be in flight."""
 
 LEAST_ACCELERATION_STD = 0.01
 """m/s2; least standard deviation of acceleration errors after levelling: Coriolis, scale factors, settling springs."""
@@ -91,6 +93,7 @@ def begin_search(state, east, north, variance):
         state.search.covariance[i, i] = variance
         state.search.covariance[2 + i, 2 + i] = START_VELOCITY_STD**2
         state.search.covariance[COSINE + i, COSINE + i] = 0.5
+    state.search.course_since = NEVER
     state.search.started = 1
 
 
