@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from eskf_ros.filter.alignment.heading_from_turning import SPOT
 from eskf_ros.filter.alignment.heading_search import SEARCH
 from eskf_ros.filter.alignment.heading_sensors import CANDIDATE
 from eskf_ros.filter.alignment.levelling import LEVELLING
@@ -88,6 +89,7 @@ STATE = np.dtype(
         ("frame", FRAME),
         ("odom", STEP),
         ("search", SEARCH),
+        ("spot", SPOT),
         ("heading", CANDIDATE),
         ("window", STATIC_WINDOW),
         ("residual", RESIDUAL_MOTION),
@@ -260,6 +262,7 @@ _NEVER = {
         "wheel_stamp",
         "slip_stamp",
     ),
+    "spot": ("stamp",),
     "seen": ("stamp", "origin_stamp", "turn_stamp"),
     "streams": (
         "last_stamp",

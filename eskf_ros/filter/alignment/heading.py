@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.alignment.heading_from_turning import turn_from_spot
 from eskf_ros.filter.alignment.heading_search import COSINE, begin_search, spread, turn_found, update_search
 from eskf_ros.filter.history.records import XX, YY, ZZ
 from eskf_ros.filter.inertial.covariance import update_error_axes
@@ -37,8 +38,10 @@ AGREEMENT = 1.5
 disagrees by as many of them as it crabs: the tighter they must agree, the more certainly it is told apart.
 """
 
-COURSE_PATIENCE = 20_000_000_000
-"""ns; for this long search and course must agree. Many a search has found the heading by itself meanwhile, better."""
+COURSE_WAY = 6.0
+"""m; over this way search and course must agree. Many a slow robot has found its heading by the search alone meanwhile,
+and better.
+"""
 
 LEAST_LENGTH = 0.5
 """Length of the found (cos, sin) along the course, at least; 1 if the model holds."""
@@ -95,6 +98,14 @@ def search_heading(state, aid, gate, settings, work):
     else:
         return
     set_east_north_up_covariance(work.noise, state, local_to_ecef, aid.payload, 3)
+    if aid.stream == Stream.GNSS_POSITION:
+        turn, std = turn_from_spot(state, measured, aid.source, settings, work)
+        found, found_std = turn_found(state)
+        does_agree = found_std == math.inf or abs(wrapped(turn - found)) < CERTAIN * math.hypot(std, found_std)
+        if std <= settings.found_heading_std and does_agree:
+            reset_heading(state, heading_of(state, settings) + turn, std, settings)
+            state.heading_known = 1
+            return
     search_with(state, first, measured, lever, gate, settings, work)
 
 
@@ -120,7 +131,7 @@ def search_with(state, first, measured, lever, gate, settings, work):
 
 @njit
 def align_to_course(state, settings):
-    """Set the unknown heading to the course over ground, if the search has confirmed it for `COURSE_PATIENCE`.
+    """Set the unknown heading to the course over ground, if the search has confirmed it over `COURSE_WAY`.
 
     Accelerations tell forward from reverse, and side slip from straight travel, before they tell the heading as
     accurately as the course does. But they tell the side slip no better than they tell the heading: what crabs may
@@ -129,9 +140,11 @@ def align_to_course(state, settings):
     heading, std = course_confirmed(state, settings)
     if std == math.inf:
         state.search.course_since = NEVER
-    elif state.search.course_since == NEVER:
+        return
+    if state.search.course_since == NEVER:
         state.search.course_since = state.stamp
-    elif state.stamp - state.search.course_since >= COURSE_PATIENCE:
+    speed = math.hypot(state.search.estimate[2], state.search.estimate[3])
+    if (state.stamp - state.search.course_since) * 1e-9 * speed >= COURSE_WAY:
         reset_heading(state, heading, std, settings)
         state.heading_known = 1
 

@@ -35,12 +35,13 @@ SEARCH = np.dtype(
         ("estimate", "f8", (SEARCH_SIZE,)),
         ("covariance", "f8", (SEARCH_SIZE, SEARCH_SIZE)),
         ("age", "f8"),
+        ("turning_age", "f8"),
         ("course_since", "i8"),
     ],
     align=True,
 )
 """The search for the heading: whether it has started, its states and their covariance, the seconds since the last
-level (``age``), and since when the course over ground agrees with it (ns).
+level (``age``) and since the gyros were last known to stand or the search began (``turning_age``), and since when the course over ground agrees with it (ns).
 """
 
 COSINE = 4
@@ -75,8 +76,9 @@ LENGTH_STD = 0.25
 
 @njit
 def forget_search(state):
-    """Stop the search, so that the next fix begins a new one."""
+    """Stop the search and the watch for a turn in place, so that the next fix begins new ones."""
     state.search.started = 0
+    state.spot.stamp = NEVER
 
 
 @njit
@@ -93,6 +95,7 @@ def begin_search(state, east, north, variance):
         state.search.covariance[i, i] = variance
         state.search.covariance[2 + i, 2 + i] = START_VELOCITY_STD**2
         state.search.covariance[COSINE + i, COSINE + i] = 0.5
+    state.search.turning_age = 0.0
     state.search.course_since = NEVER
     state.search.started = 1
 
@@ -173,13 +176,15 @@ def predict_search(state, acceleration, rotation, dt, settings):
         accel_variance = max(accel_variance, state.covariance[ACCEL_BIAS + i, ACCEL_BIAS + i])
     # A constant rate error turns by its std times the age: variance std^2 age^2, of which this is the growth.
     drift = settings.gyro_noise_density**2 + 2.0 * gyro_variance * state.search.age
+    turn_drift = settings.gyro_noise_density**2 + 2.0 * gyro_variance * state.search.turning_age
     velocity_noise = settings.accel_noise_density**2 + LEANING_TIME * leaning * accel_variance
     for i in range(2):
         p[2 + i, 2 + i] += velocity_noise * dt
-        p[COSINE + i, COSINE + i] += drift * dt
+        p[COSINE + i, COSINE + i] += turn_drift * dt
         p[TILT + i, TILT + i] += STANDARD_GRAVITY**2 * drift * dt
         p[BIAS + i, BIAS + i] += settings.accel_bias_random_walk**2 * dt
     state.search.age += dt
+    state.search.turning_age += dt
 
 
 @njit

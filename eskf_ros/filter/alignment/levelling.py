@@ -61,6 +61,7 @@ def level(state, sums, count, interval, is_rest, settings):
         return
     if is_rest:
         note_sway(state, is_first, settings)
+        state.search.turning_age = 0.0
         tilt_noise = tilt_noise_at_rest(state, duration, strength, settings)
         if is_level_better_known(state, accel_variance / strength**2 + tilt_noise):
             return
