@@ -43,6 +43,16 @@ COURSE_WAY = 6.0
 and better.
 """
 
+FAST = 20.0
+"""m/s; wind and current set off a craft that is faster by a small angle only: the search need not exclude a large one.
+"""
+
+FAST_SEARCH_STD = 0.35
+"""rad; `COURSE_SEARCH_STD` of such a craft."""
+
+WIND = 5.0
+"""m/s; standard deviation of what sets it off."""
+
 LEAST_LENGTH = 0.5
 """Length of the found (cos, sin) along the course, at least; 1 if the model holds."""
 
@@ -179,15 +189,21 @@ def course_confirmed(state, settings):
     ahead = cosine * state.search.estimate[COSINE] + sine * state.search.estimate[COSINE + 1]
     aside = cosine * state.search.estimate[COSINE + 1] - sine * state.search.estimate[COSINE]
     ahead_std, aside_std = spread(state, cosine, sine)
-    if (
-        abs(ahead) < max(CERTAIN * ahead_std, LEAST_LENGTH)
-        or aside_std > COURSE_SEARCH_STD * abs(ahead)
-        or abs(aside) > AGREEMENT * aside_std
-    ):
+    if abs(ahead) < max(CERTAIN * ahead_std, LEAST_LENGTH):
+        return 0.0, math.inf
+    off, off_std = abs(aside / ahead), aside_std / abs(ahead)
+    course_variance = across_variance / speed**2 + settings.course_std**2
+    if speed > FAST:
+        course_variance += (WIND / speed) ** 2
+        does_agree = off_std < FAST_SEARCH_STD and off < CERTAIN * math.sqrt(off_std**2 + course_variance)
+    else:
+        course_variance += off_std**2
+        does_agree = off_std < COURSE_SEARCH_STD and off < AGREEMENT * off_std
+    if not does_agree:
         return 0.0, math.inf
     if ahead < 0.0:
         heading += math.pi
-    return heading, math.sqrt(across_variance / speed**2 + settings.course_std**2 + (aside_std / ahead) ** 2)
+    return heading, math.sqrt(course_variance)
 
 
 @njit

@@ -83,7 +83,10 @@ def turn_from_spot(state, measured, source, settings, work):
     # measured = centre + lever turned by (cos, sin), one axis after the other: fixes of receivers are round.
     x = spot.estimate
     variance = max(work.noise[0, 0], work.noise[1, 1])
-    excess = (measured[0] - x[0] - lever[0] * x[2] + lever[1] * x[3], measured[1] - x[1] - lever[1] * x[2] - lever[0] * x[3])
+    excess = (
+        measured[0] - x[0] - lever[0] * x[2] + lever[1] * x[3],
+        measured[1] - x[1] - lever[1] * x[2] - lever[0] * x[3],
+    )
     if nis_of(p, lever, excess, variance) > SPOT_GATE:
         spot.misses += 1
         return 0.0, math.inf

@@ -61,18 +61,19 @@ def level(state, sums, count, interval, is_rest, settings):
         return
     if is_rest:
         note_sway(state, is_first, settings)
-        state.search.turning_age = 0.0
         tilt_noise = tilt_noise_at_rest(state, duration, strength, settings)
         if is_level_better_known(state, accel_variance / strength**2 + tilt_noise):
             return
     else:
-        tilt_noise = settings.moving_tilt_std**2 + dot(rate, rate) * (UNKNOWN_SPEED / strength) ** 2
+        tilt_noise = settings.moving_tilt_std**2 + dot(rate, rate) * (assumed_speed(state) / strength) ** 2
     heading = heading_of(state, settings)
     up = local_up(state)
     measured = rotate(to_matrix(state.attitude), (force[0] / strength, force[1] / strength, force[2] / strength))
     reset_attitude(state, shortest_turn(measured, up))
     reset_tilt(state, up, strength, accel_bias, accel_variance, tilt_noise, settings)
     update_gyro_bias_at_rest(state, gyro_bias, gyro_variance, rate, up, duration, is_rest, settings)
+    if is_rest:
+        state.search.turning_age = 0.0
     # The parameter holds at the first start only: after a restart the robot may have turned.
     if state.level_known == 0 and state.restarts == 0 and not math.isnan(settings.initial_heading):
         state.heading_known = 1
@@ -167,6 +168,14 @@ def reset_tilt(state, up, strength, accel_bias, accel_variance, tilt_noise, sett
 
 
 @njit
+def assumed_speed(state):
+    """Return the speed (m/s) with which a robot is assumed to move through a turn: the one that GNSS tells, if faster."""
+    if state.position_known == 0:
+        return UNKNOWN_SPEED
+    return max(UNKNOWN_SPEED, math.hypot(state.velocity_map[0], state.velocity_map[1]))
+
+
+@njit
 def keep_gyro_bias(state):
     """Keep the known gyro bias when a run of still windows begins, as the prior of the whole run."""
     state.levelling.kept_gyro_variance = math.inf
@@ -202,7 +211,7 @@ def update_level_in_motion(state, settings):
         return
     n = state.window.samples
     rate_square = (state.window.total[3] ** 2 + state.window.total[4] ** 2 + state.window.total[5] ** 2) / n**2
-    fresh = settings.moving_tilt_std**2 + rate_square * (UNKNOWN_SPEED / STANDARD_GRAVITY) ** 2
+    fresh = settings.moving_tilt_std**2 + rate_square * (assumed_speed(state) / STANDARD_GRAVITY) ** 2
     drifted = max(state.covariance[ATTITUDE, ATTITUDE], state.covariance[ATTITUDE + 1, ATTITUDE + 1])
     if drifted > DRIFTED * fresh:
         level(state, state.window.total, n, settings.static_duration / n, False, settings)

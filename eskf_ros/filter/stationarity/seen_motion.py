@@ -272,9 +272,7 @@ def judge(state, eye, up_variance):
         return Seen.MOTION
     if level > max(REST_SIGMAS * level_std, STEADY_ERROR) or level + EXCLUDED * level_std > SLOWEST:
         return Seen.NOTHING
-    if has_up and (
-        climb > max(REST_SIGMAS * climb_std, STEADY_ERROR) or climb + EXCLUDED * climb_std > 2.0 * SLOWEST
-    ):
+    if has_up and (climb > max(REST_SIGMAS * climb_std, STEADY_ERROR) or climb + EXCLUDED * climb_std > 2.0 * SLOWEST):
         return Seen.NOTHING
     return Seen.REST
 
