@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.filter.state.enums import Stream, Verdict
+from eskf_ros.simulate.aeroplane import AeroplaneTrajectory
 from eskf_ros.simulate.boat import BoatTrajectory
 from eskf_ros.simulate.jets import Taylor, sin_cos
 from eskf_ros.simulate.motion import Trajectory
 from eskf_ros.simulate.path import PathState
-from eskf_ros.simulate.profile import Hold, Instruction, SpeedTo, Turn, TurnInPlace
+from eskf_ros.simulate.profile import Hold, Instruction, LiftOff, SpeedTo, Turn, TurnInPlace
 from eskf_ros.simulate.recording import Recording
 from eskf_ros.simulate.scenario import SCENARIOS, Scenario, simulate
 from eskf_ros.simulate.trajectory import DriveTrajectory
@@ -118,6 +119,21 @@ def crabbing_boat(heading_deg: float) -> Trajectory:
         ),
         heading_deg,
     )
+
+
+def flight(speed: float) -> Move:
+    """An aeroplane that is in level flight at ``speed`` (m/s) before it turns."""
+    instructions = (
+        Hold(5.0),
+        SpeedTo(speed, 8.0),
+        LiftOff(),
+        Hold(20.0),
+        Turn(-90.0, 4.0),
+        Hold(15.0),
+        Turn(120.0, 5.0),
+        Hold(60.0),
+    )
+    return lambda heading_deg: AeroplaneTrajectory(instructions, heading_deg)
 
 
 def false_rest(recording: Recording, records: NDArray[Any], speed: float = 0.03, rate_deg: float = 0.05) -> int:

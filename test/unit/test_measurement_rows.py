@@ -13,6 +13,7 @@ from eskf_ros.bags.messages import message_dtype
 from eskf_ros.filter.fuse import linearize
 from eskf_ros.filter.history.records import AID
 from eskf_ros.filter.inertial.navigation_frame import local_east_north_up_to_ecef
+from eskf_ros.filter.measurements import zaru
 from eskf_ros.filter.measurements.row import Row
 from eskf_ros.filter.rows import CONSTRAINTS, ROWS, SENSORS
 from eskf_ros.filter.settings import gate_probability, intakes_from, settings_from
@@ -77,7 +78,8 @@ def prepared(seed: int, settings: Any) -> Any:
     state["covariance"][:15, :15] = np.diag(np.repeat([1.0, 0.01, 1e-4, 0.01, 1e-6], 3))
     update_error_size(state, int(settings["reach"].max()), settings)
     stamp = 100 * CONSTRAINT_INTERVAL
-    rest, readings = state["rest"], np.concatenate([state["specific_force"], state["angular_rate"]])
+    # The block is that of a robot at rest, whose gyros read their bias and the turn of the Earth.
+    rest, readings = state["rest"], np.concatenate([state["specific_force"], np.array(zaru.predict(state)) + 5e-4])
     state["stamp"] = state["imu"]["stamp"] = rest["block_end"] = rest["resting_stamp"] = stamp
     state["imu"]["interval"] = 0.01
     rest["block_count"], rest["block_half_count"] = 10, 5

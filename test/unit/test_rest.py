@@ -85,6 +85,8 @@ def resting(seed: int) -> Any:
     stamp = 100 * CONSTRAINT_INTERVAL
     state["stamp"] = state["imu"]["stamp"] = state["rest"]["block_end"] = state["rest"]["resting_stamp"] = stamp
     state["rest"]["block_count"], state["rest"]["block_half_count"] = 10, 5
+    # At rest the gyros read their bias and the turn of the Earth.
+    state["angular_rate"] = np.array(zaru.predict(state)) + np.random.default_rng(seed).normal(0.0, 5e-4, 3)
     readings = np.concatenate([state["specific_force"], state["angular_rate"]])
     state["rest"]["block_sum"], state["rest"]["block_half_sum"] = 10.0 * readings, 5.0 * readings
     state["rest"]["block_square_sum"] = 10.0 * readings**2

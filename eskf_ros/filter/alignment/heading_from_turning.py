@@ -55,9 +55,9 @@ LENGTH_STD = 0.15
 
 @njit
 def turn_from_spot(state, measured, source, settings, work):
-    """Update the turn in place with a fix (m, map; noise in ``work``); return turn and std (rad; infinite if undecided).
+    """Update the turn in place with a fix (m, map; noise in ``work``); return turn and standard deviation (rad).
 
-    The turn leads from the level axes to the map, as in `heading_search.turn_found`.
+    The turn leads from the level axes to the map, as in `heading_search.turn_found`; undecided: infinite.
     """
     base = settings.imu_position_base
     arm = rotate_back(settings.imu_to_base, (base[0], base[1], base[2]))

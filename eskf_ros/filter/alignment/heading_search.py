@@ -40,8 +40,11 @@ SEARCH = np.dtype(
     ],
     align=True,
 )
-"""The search for the heading: whether it has started, its states and their covariance, the seconds since the last
-level (``age``) and since the gyros were last known to stand or the search began (``turning_age``), and since when the course over ground agrees with it (ns).
+"""The search for the heading: whether it has started, its states and their covariance.
+
+- ``age``: seconds since the last level.
+- ``turning_age``: seconds since the gyros last stood or, if later, since the search began.
+- ``course_since``: since when the course over ground agrees with it (ns).
 """
 
 COSINE = 4

@@ -169,7 +169,7 @@ def reset_tilt(state, up, strength, accel_bias, accel_variance, tilt_noise, sett
 
 @njit
 def assumed_speed(state):
-    """Return the speed (m/s) with which a robot is assumed to move through a turn: the one that GNSS tells, if faster."""
+    """Return the speed (m/s) that a robot is assumed to have in a turn: that which GNSS tells, if it is faster."""
     if state.position_known == 0:
         return UNKNOWN_SPEED
     return max(UNKNOWN_SPEED, math.hypot(state.velocity_map[0], state.velocity_map[1]))
