@@ -94,7 +94,7 @@ def test_without_an_antenna_the_gyro_itself_shows_a_slow_turn(seed: int) -> None
 
 @pytest.mark.parametrize("is_told", [True, False], ids=["told", "default"])
 def test_what_stands_is_held(is_told: bool) -> None:
-    """With velocities from a few seconds after the stop on, with RTK fixes as soon, with fixes of a metre in a minute."""
+    """With velocities from seconds after the stop on, with RTK fixes as soon, with fixes of a metre in a minute."""
     parked = gentle.drive((gentle.Hold(20.0), gentle.SpeedTo(8.0), gentle.SpeedTo(0.0), gentle.Hold(150.0)))
     stop = 20.0 + 5.2 + 5.2
     for changes, options, since in (
