@@ -65,7 +65,6 @@ class _Messages:
     channel: NDArray[np.int64]
     log_time: NDArray[np.int64]
     offset: NDArray[np.int64]
-    end: int  # offset behind the last complete record
 
 
 def _decompress(compression: str, data: bytes | memoryview, size: int, incomplete: bool) -> bytes | memoryview:
@@ -80,7 +79,8 @@ def _decompress(compression: str, data: bytes | memoryview, size: int, incomplet
                 raw = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
                 if len(raw) == size:
                     return raw
-            return zstandard.ZstdDecompressor().decompressobj(read_across_frames=True).decompress(data)
+            stream = zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True)
+            return stream.read(size)
         if compression == "lz4":
             return cast(bytes, lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=-1 if incomplete else size))
     except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError, ValueError) as error:
@@ -127,6 +127,7 @@ class McapFile:
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._counts: dict[int, int] = {}
+        self._stated: dict[int, int] = {}  # messages by channel as the statistics say, if they can be read
         self._chunks: list[_Chunk] = []
         self._skipped: dict[int, str] = {}  # offset of a damaged chunk -> what is wrong
         try:
@@ -134,7 +135,9 @@ class McapFile:
             with path.open("rb") as file:
                 if file.read(len(MAGIC)) != MAGIC:
                     raise BagError(f"{path}: not an mcap file")
-                if not self._read_summary(file):
+                if self._read_summary(file):
+                    self._counts = self._stated
+                else:
                     self._scan(file)
         except OSError as error:
             raise BagError(f"{path}: {error.strerror or error}") from error
@@ -143,8 +146,11 @@ class McapFile:
             known = self.topics.get(channel.topic)
             self.topics[channel.topic] = TopicInfo(
                 known.type if known else self._type_of(channel),
-                (known.count if known else 0) + self._counts.get(number, 0),
+                (known.count if known else 0) + max(self._counts.get(number, 0), self._stated.get(number, 0)),
             )
+        strangers = sum(count for number, count in self._counts.items() if number not in self._channels)
+        if strangers:
+            self._warnings.append(f"{self.path}: {strangers} messages belong to no known topic; skipped")
 
     @property
     def warnings(self) -> list[str]:
@@ -209,12 +215,13 @@ class McapFile:
                 position += 9 + length
         except (McapError, struct.error, UnicodeDecodeError, OverflowError):
             statistics = None
+        if statistics is not None:
+            self._stated = statistics.channel_message_counts
         if statistics is None or not self._is_complete(statistics):
             self._schemas.clear()
             self._channels.clear()
             self._chunks.clear()
             return False
-        self._counts = statistics.channel_message_counts
         self.start_time, self.end_time = statistics.message_start_time, statistics.message_end_time
         return True
 
@@ -261,7 +268,7 @@ class McapFile:
                 loose = None
                 try:
                     raw, start, _ = _open_chunk(self._read_at(file, position, 9 + length), incomplete)
-                    times = self._survey(raw)
+                    times = self._survey(raw, None if incomplete else position)
                 except _Damage as damage:
                     if incomplete:
                         break
@@ -297,15 +304,19 @@ class McapFile:
             )
         self.start_time, self.end_time = (first, last) if self._chunks else (0, 0)
 
-    def _survey(self, raw: memoryview) -> NDArray[np.int64]:
-        """Count the messages of a chunk by channel; return their times."""
-        messages = self._walk(raw)
+    def _survey(self, raw: memoryview, chunk: int | None) -> NDArray[np.int64]:
+        """Count the messages of a chunk by channel; return their times. ``chunk`` as in `_walk`."""
+        messages = self._walk(raw, chunk)
         for number, count in zip(*np.unique(messages.channel, return_counts=True), strict=True):
             self._counts[int(number)] = self._counts.get(int(number), 0) + int(count)
         return messages.log_time
 
-    def _walk(self, raw: memoryview) -> _Messages:
-        """Find the messages in a run of records one by one; remember channels and schemas on the way."""
+    def _walk(self, raw: memoryview, chunk: int | None) -> _Messages:
+        """Find the messages in a run of records one by one; remember channels and schemas on the way.
+
+        Ends at the first damaged record, which is told with ``chunk``, the offset of the run in the file; None for a
+        run that is known to be cut off.
+        """
         channels: list[int] = []
         times: list[int] = []
         offsets: list[int] = []
@@ -328,7 +339,10 @@ class McapFile:
                 except (McapError, struct.error, UnicodeDecodeError):
                     break
             position = end
-        return _Messages(np.array(channels, np.int64), np.array(times, np.int64), np.array(offsets, np.int64), position)
+        if position < size and chunk is not None:
+            reason = f"damaged record at byte {position} of {size} of its messages; those before it are used"
+            self._skipped.setdefault(chunk, reason)
+        return _Messages(np.array(channels, np.int64), np.array(times, np.int64), np.array(offsets, np.int64))
 
     def blocks(self, topics: Mapping[str, str]) -> Iterator[Block]:
         """See `Source.blocks`.
@@ -352,10 +366,10 @@ class McapFile:
             try:
                 with self.path.open("rb") as file:
                     record = self._read_at(file, chunk.offset, chunk.length + chunk.index_length)
+                incomplete = chunk.offset + chunk.length > self.bytes_total
                 if chunk.loose:
                     raw = memoryview(record)
                 else:
-                    incomplete = chunk.offset + chunk.length > self.bytes_total
                     raw, _, _ = _open_chunk(memoryview(record)[: chunk.length], incomplete)
             except (_Damage, OSError) as error:
                 self._skipped[chunk.offset] = str(error)
@@ -363,7 +377,7 @@ class McapFile:
             index = memoryview(record)[chunk.length :]
             found = self._indexed(raw, index, chunk, wanted) if chunk.index_offsets else None
             if found is None:
-                found = self._walked(raw, wanted)
+                found = self._walked(raw, wanted, None if incomplete else chunk.offset)
             return {topic: _payloads(raw, offsets) for topic, offsets in found.items()}
 
         return Block(min(chunk.start, _LAST_TIME), chunk.offset, chunk.length + chunk.index_length, load)
@@ -391,8 +405,8 @@ class McapFile:
         # The order of the index may differ from that of the file.
         return {topic: np.sort(np.concatenate(parts)) for topic, parts in found.items()}
 
-    def _walked(self, raw: memoryview, wanted: dict[int, str]) -> dict[str, NDArray[np.int64]]:
-        messages = self._walk(raw)
+    def _walked(self, raw: memoryview, wanted: dict[int, str], chunk: int | None) -> dict[str, NDArray[np.int64]]:
+        messages = self._walk(raw, chunk)
         found = {}
         for topic in sorted(set(wanted.values())):
             numbers = [number for number, name in wanted.items() if name == topic]

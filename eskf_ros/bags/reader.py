@@ -122,6 +122,7 @@ class BagReader:
 
     def _batches(self, topics: Mapping[str, str]) -> Iterator[dict[str, Batch]]:
         self.bytes_done = 0
+        found = dict.fromkeys(topics, 0)
         malformed: dict[str, int] = {}
         uncarried: dict[str, int] = {}
         misplaced = 0
@@ -135,6 +136,7 @@ class BagReader:
             loaded = block.load()
             following = next(blocks, None)
             for topic, payloads in loaded.items():
+                found[topic] += len(payloads.log_time)
                 already = self._strings.uncarried
                 piece, bad = self._decode(topics[topic], payloads, order)
                 if self._strings.uncarried > already:
@@ -157,6 +159,8 @@ class BagReader:
                     emitted = until if until is not None else emitted
                     yield batch
         self.bytes_done = self.bytes_total
+        stated = {topic: self.topics[topic].count for topic in topics}
+        self._own_warnings += _differences(self._sources[0].name, found, stated)
         for topic, count in malformed.items():
             self._own_warnings.append(
                 f"{self._sources[0].name}: "
@@ -276,12 +280,12 @@ def _open_directory(path: Path, warnings: list[str]) -> list[Source]:
     """Return the files of a rosbag2 directory; unreadable files become warnings as long as one can be opened."""
     metadata = path / "metadata.yaml"
     files = sorted(file for file in path.iterdir() if file.suffix in (".mcap", ".db3"))
+    information: dict[str, Any] = {}
     if metadata.exists():
         information = _read_metadata(metadata, warnings)
-        if information.get("compression_mode", "").lower() in ("message", "file"):
+        if str(information.get("compression_mode")).lower() in ("message", "file"):
             return [RosbagsDirectory(path)]
-        listed = [path / Path(name).name for name in information.get("relative_file_paths", [])]
-        files = listed or files
+        files = _listed(information, path) or files
     elif files:
         warnings.append(f"{path}: no metadata.yaml (was the recording cut off?); all files in the directory are read")
     if not files:
@@ -296,7 +300,34 @@ def _open_directory(path: Path, warnings: list[str]) -> list[Source]:
     if not sources:
         raise failures[0]
     warnings.extend(f"{failure}; the other files are used" for failure in failures)
+    stated = _stated(information)
+    there = {topic: sum(source.topics[topic].count for source in sources if topic in source.topics) for topic in stated}
+    warnings += _differences(str(metadata), there, stated)
     return sources
+
+
+def _differences(name: str, found: dict[str, int], stated: dict[str, int]) -> list[str]:
+    """Return what to say of topics with another number of messages than a file states: one line, or none."""
+    differing = [f"{count} of {stated[topic]} of {topic}" for topic, count in found.items() if count != stated[topic]]
+    return [f"{name}: messages found, of those it states: {', '.join(differing)}"] if differing else []
+
+
+def _listed(information: dict[str, Any], path: Path) -> list[Path]:
+    """Return the files that metadata.yaml names; what is no list of names names none."""
+    names = information.get("relative_file_paths")
+    return [path / Path(name).name for name in names if isinstance(name, str)] if isinstance(names, list) else []
+
+
+def _stated(information: dict[str, Any]) -> dict[str, int]:
+    """Return the numbers of messages by topic of metadata.yaml, as far as it has them."""
+    found = {}
+    entries = information.get("topics_with_message_count")
+    for entry in entries if isinstance(entries, list) else []:
+        if isinstance(entry, dict) and isinstance(entry.get("topic_metadata"), dict):
+            name, count = entry["topic_metadata"].get("name"), entry.get("message_count")
+            if isinstance(name, str) and isinstance(count, int):
+                found[name] = count
+    return found
 
 
 def _read_metadata(path: Path, warnings: list[str]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,9 @@ _ROWS_PER_BLOCK = 8192
 _BYTES_PER_BLOCK = 16 << 20
 
 Row = tuple[str, int, bytes]  # topic, log time (ns), serialised message
+
+_SOUND = "typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' AND typeof(data) = 'blob'"
+"""Rows of the table of messages that can be messages: any column of sqlite3 takes any type of value."""
 
 
 class _RowSource:
@@ -40,7 +43,7 @@ class _RowSource:
 
     def blocks(self, topics: Mapping[str, str]) -> Iterator[Block]:
         """See `Source.blocks`."""
-        wanted = {topic: info.count for topic, info in self.topics.items() if topic in topics and info.count}
+        wanted = {topic: info.count for topic, info in self.topics.items() if topic in topics}
         remaining = sum(wanted.values())
         bytes_per_row = self.bytes_total / max(remaining, 1)
         rows = self._survivors(wanted)
@@ -96,6 +99,20 @@ def _by_topic(rows: Sequence[Row]) -> dict[str, Payloads]:
     return found
 
 
+class _Count(NamedTuple):
+    """Number of messages, and log times (ns) of the first and the last."""
+
+    messages: int
+    first: int
+    last: int
+
+    def joined(self, other: _Count | None) -> _Count:
+        """Return the same of both."""
+        if other is None:
+            return self
+        return _Count(self.messages + other.messages, min(self.first, other.first), max(self.last, other.last))
+
+
 class SqliteFile(_RowSource):
     """One .db3 file as a `Source`."""
 
@@ -114,6 +131,7 @@ class SqliteFile(_RowSource):
         address = (Path(self._copy.name) if self._copy else path.absolute()).as_uri()
         try:
             self._connection = sqlite3.connect(f"{address}?{access}", uri=True)
+            self._connection.text_factory = lambda text: text.decode("utf-8", "replace")
             try:
                 topics = self._connection.execute("SELECT id, name, type FROM topics").fetchall()
             except BaseException:
@@ -121,36 +139,60 @@ class SqliteFile(_RowSource):
                 raise
         except (sqlite3.Error, ValueError) as error:  # ValueError: an error text that is no UTF-8 (CPython)
             raise BagError(f"{path}: cannot be read as a rosbag2 sqlite3 file ({one_line(error)})") from error
-        self._names: dict[int, str] = {number: name for number, name, _ in topics}
+        sound = [row for row in topics if tuple(map(type, row)) == (int, str, str) and row[1]]
+        if len(sound) < len(topics):
+            self.warnings.append(f"{path}: {len(topics) - len(sound)} of {len(topics)} topics cannot be read; skipped")
+        self._names: dict[int, str] = {number: name for number, name, _ in sound}
         self._damaged = False
-        counts: dict[int, tuple[int, int, int]] = {}
         try:
-            for number, *values in self._connection.execute(
-                "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY topic_id"
-            ):
-                count, first, last = map(int, values)
-                counts[number] = (count, first, last)
-        except (sqlite3.Error, TypeError, ValueError):
+            counts = self._count(by_sqlite=True)
+        except sqlite3.Error:
             self._damaged = True
-            counts = self._count_survivors()
+            counts = self._count(by_sqlite=False)
         self.topics = {}
-        for number, name, type_name in topics:
+        for number, name, type_name in sound:
             known = self.topics[name].count if name in self.topics else 0
-            self.topics[name] = TopicInfo(type_name, known + counts.get(number, (0, 0, 0))[0])
-        self.start_time = min((first for _, first, _ in counts.values()), default=0)
-        self.end_time = max((last for _, _, last in counts.values()), default=0)
+            self.topics[name] = TopicInfo(type_name, known + (counts[number].messages if number in counts else 0))
+        known_counts = [counts[number] for number in self._names if number in counts]
+        self.start_time = min((count.first for count in known_counts), default=0)
+        self.end_time = max((count.last for count in known_counts), default=0)
 
-    def _count_survivors(self) -> dict[int, tuple[int, int, int]]:
-        counts: dict[int, tuple[int, int, int]] = {}
+    def _count(self, by_sqlite: bool) -> dict[int, _Count]:
+        """Return what is known of the messages of each topic, and tell which rows are missing or cannot be read.
+
+        Raises:
+            sqlite3.Error: the file is damaged; not if counted row by row, which ends where the damage begins.
+        """
+        counts: dict[int, _Count] = {}
+        total = strange = 0
+        first_id, last_id = None, 0
+        columns = "topic_id, %s, %s, %s, %s, %s"
+        grouped = columns % ("timestamp", "timestamp", "1", "id", "id")
+        if by_sqlite:
+            grouped = columns % ("min(timestamp)", "max(timestamp)", "count(*)", "min(id)", "max(id)")
+        table = "messages" if by_sqlite else "messages NOT INDEXED"
+        grouping = " GROUP BY topic_id, sound" if by_sqlite else ""
         try:
-            for number, time in self._connection.execute("SELECT topic_id, timestamp FROM messages NOT INDEXED"):
-                count, first, last = counts.get(number, (0, time, time))
-                counts[number] = (count + 1, min(first, time), max(last, time))
-        except (sqlite3.Error, TypeError, ValueError) as error:
-            done = sum(count for count, _, _ in counts.values())
+            for number, first, last, count, low, high, sound in self._connection.execute(
+                f"SELECT {grouped}, ({_SOUND}) AS sound FROM {table}{grouping}"
+            ):
+                total += count
+                first_id, last_id = low if first_id is None else min(first_id, low), max(last_id, high)
+                if sound and number in self._names:
+                    counts[number] = _Count(count, first, last).joined(counts.get(number))
+                else:
+                    strange += count
+        except sqlite3.Error as error:
+            if by_sqlite:
+                raise
             self.warnings.append(
-                f"{self.name}: damaged after {done} messages ({one_line(error)}); the messages before are used"
+                f"{self.name}: damaged after {total} messages ({one_line(error)}); the messages before are used"
             )
+        if strange:
+            self.warnings.append(f"{self.name}: {strange} of {total} messages have no topic, time or content; skipped")
+        missing = last_id - (first_id or 1) + 1 - total
+        if missing > 0:
+            self.warnings.append(f"{self.name}: {missing} messages between the {total} that are there are missing")
         return counts
 
     def _rows(self, topics: Container[str]) -> Iterator[Row]:
@@ -158,12 +200,12 @@ class SqliteFile(_RowSource):
         chosen = ",".join(map(str, numbers))
         # Sorting needs every row; in a damaged file the rows are taken as they lie, which is the order of recording.
         table, order = ("messages NOT INDEXED", "") if self._damaged else ("messages", " ORDER BY timestamp, id")
-        query = f"SELECT topic_id, timestamp, data FROM {table} WHERE topic_id IN ({chosen}){order}"
+        query = f"SELECT topic_id, timestamp, data FROM {table} WHERE topic_id IN ({chosen}) AND {_SOUND}{order}"
         with closing(self._connection.cursor()) as cursor:
             try:
                 for number, time, data in cursor.execute(query):
-                    yield numbers[number], int(time), bytes(data)
-            except (sqlite3.Error, TypeError, ValueError):
+                    yield numbers[number], time, data
+            except sqlite3.Error:
                 if not self._damaged:
                     raise
 
@@ -209,8 +251,11 @@ class RosbagsDirectory(_RowSource):
         try:
             self._reader: Reader = Reader(path)
             self._reader.open()
+            self._describe(path)
         except Exception as error:  # damaged input surfaces as many types there
             raise BagError(f"{path}: {one_line(error)}") from error
+
+    def _describe(self, path: Path) -> None:
         self.topics = {name: TopicInfo(info.msgtype or "", info.msgcount) for name, info in self._reader.topics.items()}
         counted = self._reader.message_count > 0
         self.start_time, self.end_time = (self._reader.start_time, self._reader.end_time - 1) if counted else (0, 0)
@@ -219,7 +264,8 @@ class RosbagsDirectory(_RowSource):
     def _rows(self, topics: Container[str]) -> Iterator[Row]:
         connections = [connection for connection in self._reader.connections if connection.topic in topics]
         for connection, log_time, data in self._reader.messages(connections):
-            yield connection.topic, log_time, bytes(data)
+            if type(log_time) is int and isinstance(data, (bytes, memoryview)):
+                yield connection.topic, log_time, bytes(data)
 
     def close(self) -> None:
         """Close the files and remove the temporary ones."""
