@@ -190,6 +190,7 @@ class McapFile:
             return False
         summary = self._read_at(file, footer.summary_start, footer_offset - footer.summary_start)
         if footer.summary_crc and zlib.crc32(tail[:25], zlib.crc32(summary)) != footer.summary_crc:
+            self._warnings.append(f"{self.path}: the summary at its end is damaged; the file is read without it")
             return False
         statistics: Statistics | None = None
         position = 0

@@ -121,7 +121,8 @@ def number_column(found: NDArray[Any], name: str, missing: float = math.nan) -> 
         return np.full(len(found), missing)
     if found.dtype[name].shape:
         raise CloudError(f"field {name} holds {math.prod(found.dtype[name].shape)} numbers, not one")
-    return np.asarray(found[name]).astype(np.float64)
+    with np.errstate(invalid="ignore"):  # of a damaged message: a signalling NaN
+        return np.asarray(found[name]).astype(np.float64)
 
 
 def whole_column(found: NDArray[Any], name: str, missing: int) -> NDArray[np.int64]:

@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import sqlite3
 import struct
+import warnings
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from damaged_recordings import FAILURES, run, whole_results
 from eskf_ros.bags import BagError, open_bag
+from eskf_ros.gnss.cloud import number_column
 from support.damage import Files, recordings, write
 
 IMU, FIX = "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix"
@@ -57,24 +60,26 @@ def test_a_database_with_other_values_where_its_numbers_belong(
 ) -> None:
     bag = write(sound[kind], tmp_path)
     changed(bag, f"UPDATE messages SET {column} = ? WHERE id BETWEEN 101 AND 150", value)
-    counts, warnings = read(bag)
+    counts, said = read(bag)
     assert 440 < counts["imu/data"] < 480
-    said = [line for line in warnings if "metadata.yaml" not in line]
-    assert said == [f"{tmp_path / 'bag.db3'}: 50 of 655 messages have no topic, time or content; skipped"]
-    assert (len(warnings) == 2) == (kind == "db3 directory")
+    of_metadata = [line for line in said if "metadata.yaml" in line]
+    assert len(of_metadata) == (kind == "db3 directory")
+    assert said[len(of_metadata) :] == [
+        f"{tmp_path / 'bag.db3'}: 50 of 655 messages have no topic, time or content; skipped"
+    ]
 
 
 def test_a_topic_whose_name_is_no_text(tmp_path: Path, sound: dict[str, Files]) -> None:
     bag = changed(write(sound["db3"], tmp_path), "UPDATE topics SET name = ? WHERE name = 'gps/vel'", b"\xff")
-    counts, warnings = read(bag)
+    counts, said = read(bag)
     assert counts == WHOLE
-    assert "1 of 6 topics cannot be read; skipped" in warnings[0]
+    assert "1 of 6 topics cannot be read; skipped" in said[0]
 
 
 def test_rows_that_are_no_longer_in_a_database(tmp_path: Path, sound: dict[str, Files]) -> None:
-    counts, warnings = read(changed(write(sound["db3"], tmp_path), "DELETE FROM messages WHERE id BETWEEN 101 AND 150"))
+    counts, said = read(changed(write(sound["db3"], tmp_path), "DELETE FROM messages WHERE id BETWEEN 101 AND 150"))
     assert counts["imu/data"] < 480
-    assert warnings == [f"{tmp_path / 'bag.db3'}: 50 messages between the 605 that are there are missing"]
+    assert said == [f"{tmp_path / 'bag.db3'}: 50 messages between the 605 that are there are missing"]
 
 
 @pytest.mark.parametrize("value", [b"\xff\xfe", float("inf"), "text"])
@@ -82,9 +87,9 @@ def test_compressed_messages_with_other_values_where_times_belong(
     tmp_path: Path, sound: dict[str, Files], value: Any
 ) -> None:
     bag = write(sound["db3 compressed messages"], tmp_path)
-    counts, warnings = read(changed(bag, "UPDATE messages SET timestamp = ? WHERE id BETWEEN 101 AND 150", value))
+    counts, said = read(changed(bag, "UPDATE messages SET timestamp = ? WHERE id BETWEEN 101 AND 150", value))
     assert 440 < counts["imu/data"] < 480
-    assert f"{counts['imu/data']} of 500 of imu/data" in warnings[0]
+    assert f"{counts['imu/data']} of 500 of imu/data" in said[0]
 
 
 def test_compressed_messages_of_a_topic_without_name(tmp_path: Path, sound: dict[str, Files]) -> None:
@@ -99,21 +104,21 @@ def test_a_damaged_record_between_whole_ones(tmp_path: Path, sound: dict[str, Fi
     content = bytearray(sound["mcap without checksums"]["bag.mcap"])
     places = [place for place in range(8, 60_000) if content[place : place + 9] == struct.pack("<BQ", 5, 346)]
     content[places[60] + 4] = 0xFF
-    counts, warnings = read(write({"bag.mcap": bytes(content)}, tmp_path))
+    counts, said = read(write({"bag.mcap": bytes(content)}, tmp_path))
     assert 400 < counts["imu/data"] < 500
-    assert f"{counts['imu/data']} of 500 of imu/data" in warnings[0]
-    assert "1 damaged chunk skipped" in warnings[1]
-    assert "those before it are used" in warnings[1]
+    assert f"{counts['imu/data']} of 500 of imu/data" in said[0]
+    assert "1 damaged chunk skipped" in said[1]
+    assert "those before it are used" in said[1]
 
 
 def test_messages_of_a_channel_that_is_not_described(tmp_path: Path, sound: dict[str, Files]) -> None:
     content = bytearray(sound["mcap without chunks"]["bag.mcap"])
     places = [place for place in range(8, 60_000) if content[place : place + 9] == struct.pack("<BQ", 5, 346)]
     content[places[10] + 9] = 99
-    counts, warnings = read(write({"bag.mcap": bytes(content)}, tmp_path))
+    counts, said = read(write({"bag.mcap": bytes(content)}, tmp_path))
     assert counts == WHOLE | {"imu/data": 499}
-    assert any("1 messages belong to no known topic" in line for line in warnings)
-    assert any("499 of 500 of imu/data" in line for line in warnings)
+    assert any("1 messages belong to no known topic" in line for line in said)
+    assert any("499 of 500 of imu/data" in line for line in said)
 
 
 @pytest.mark.parametrize(
@@ -129,10 +134,28 @@ def test_metadata_with_other_values(tmp_path: Path, sound: dict[str, Files], was
     files = dict(sound["db3 directory"])
     assert was in files["metadata.yaml"]
     files["metadata.yaml"] = files["metadata.yaml"].replace(was, becomes)
-    counts, warnings = read(write(files, tmp_path))
+    counts, said = read(write(files, tmp_path))
     assert counts == WHOLE
-    said = [f"{tmp_path / 'metadata.yaml'}: messages found, of those it states: 500 of 480 of imu/data"]
-    assert warnings == (said if b"480" in becomes else [])
+    expected = [f"{tmp_path / 'metadata.yaml'}: messages found, of those it states: 500 of 480 of imu/data"]
+    assert said == (expected if b"480" in becomes else [])
+
+
+def test_a_summary_with_a_wrong_checksum_is_told(tmp_path: Path, sound: dict[str, Files]) -> None:
+    content = bytearray(sound["mcap zstd"]["bag.mcap"])
+    content[-200] ^= 1
+    counts, said = read(write({"bag.mcap": bytes(content)}, tmp_path))
+    assert counts == WHOLE
+    assert "summary at its end is damaged" in said[0]
+
+
+def test_a_satellite_with_a_signalling_nan() -> None:
+    points = np.zeros(3, [("pseudorange_std", "<f4")])
+    points["pseudorange_std"].view("<u4")[1] = 0x7F80_0001
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        column = number_column(points, "pseudorange_std")
+    assert np.isnan(column[1])
+    assert column[[0, 2]].tolist() == [0.0, 0.0]
 
 
 @pytest.mark.slow
