@@ -98,6 +98,7 @@ setup(
         "console_scripts": [
             "eskf_node = eskf_ros.ros_node.main:main",
             "eskf_replay = eskf_ros.replay.main:main",
+            "eskf_check = eskf_ros.doctor.main:main",
             "eskf_ranges = eskf_ros.inputs.ranges_command:main",
             "eskf_simulate = eskf_ros.simulate.main:main",
         ],

@@ -39,24 +39,25 @@ def _yaml_group(group: type, prefix: str, parameters: Parameters, lines: list[st
             lines.append("")
         unit = f" {leaf.rule.unit}" if leaf.rule.unit else ""
         change = "can change while running" if leaf.rule.live else "read at start"
-        limits = f"Default {_yaml_value(leaf.default)}{unit}; {leaf.allowed()}; {change}."
+        limits = f"Default {yaml_value(leaf.default)}{unit}; {leaf.allowed()}; {change}."
         for text in (leaf.rule.description, limits):
             lines += textwrap.wrap(text, 116, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ")
         value = value_of(parameters, name)
         if value == ():
             # ROS makes an empty list a parameter without a type, which no node can declare: write it as a comment.
-            lines.append(f"{indent}# {item.name}: {_yaml_value((0.0,) * max(leaf.rule.lengths))}")
+            lines.append(f"{indent}# {item.name}: {yaml_value((0.0,) * max(leaf.rule.lengths))}")
         else:
-            lines.append(f"{indent}{item.name}: {_yaml_value(value)}")
+            lines.append(f"{indent}{item.name}: {yaml_value(value)}")
 
 
-def _yaml_value(value: Value) -> str:
+def yaml_value(value: Value) -> str:
+    """Return a value as a ROS parameter file holds it."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
         return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
     if isinstance(value, tuple):
-        return f"[{', '.join(_yaml_value(element) for element in value)}]"
+        return f"[{', '.join(yaml_value(element) for element in value)}]"
     if isinstance(value, int):
         return str(value)
     if math.isnan(value):
@@ -90,7 +91,7 @@ def _markdown_table(members: list[Leaf]) -> list[str]:
     for leaf in members:
         rule = leaf.rule
         live = "yes" if rule.live else "no"
-        cells = (f"`{leaf.name}`", f"`{_yaml_value(leaf.default)}`", rule.unit, leaf.allowed(), live, rule.description)
+        cells = (f"`{leaf.name}`", f"`{yaml_value(leaf.default)}`", rule.unit, leaf.allowed(), live, rule.description)
         rows.append(f"| {' | '.join(cells)} |")
     return rows
 

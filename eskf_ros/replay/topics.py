@@ -63,18 +63,22 @@ def find_topics(
     imu = _require(reader, bag, names.imu, (IMU,), "set topics.imu in --config FILE")
     needed = "ranges" if uses_ranges(parameters) else "gnss_fix"
     inputs = {}
+    empty = []
     for kind in inputs_of(parameters):
         name, remedy = getattr(names, kind.name), f"set topics.{kind.name} in --config FILE"
         if kind.name in RANGES and has_range_file:
             inputs[kind] = name
             continue
         is_required = kind.name == needed or name != getattr(Topics(), kind.name)
-        if is_required or _find(reader, name):
+        there = find_topic(reader, name)
+        if there and not is_required and not reader.topics[there].count:
+            empty.append(f"topic {there} has no messages; the recording is replayed without it")
+        elif is_required or there:
             instead = " (a RINEX file can be given with --ranges FILE.obs)" if kind.name == "ranges" else ""
             topic = _require(reader, bag, name, kind.types, remedy, instead)
             inputs[kind.of_type(reader.topics[topic].type)] = topic
     has_velocity = uses_ranges(parameters) or any(kind.stream == Stream.GNSS_VELOCITY for kind in inputs)
-    hints = [] if has_velocity else _velocity_hint(reader, names, inputs)
+    hints = empty + ([] if has_velocity else _velocity_hint(reader, names, inputs))
     beside = frozenset(inputs[kind] for kind in inputs if kind.name in RANGES) if has_range_file else frozenset()
     if not truth:
         return TopicNames(imu, inputs, beside=beside), hints
@@ -96,7 +100,7 @@ def _velocity_hint(reader: BagReader, names: Topics, inputs: Mapping[Input, str]
     return [f"no GNSS velocity on {names.gnss_velocity}; if {others[0]} is one, set topics.gnss_velocity to it"]
 
 
-def _find(reader: BagReader, name: str) -> str:
+def find_topic(reader: BagReader, name: str) -> str:
     """Return the topic `name` as it stands, in the root namespace, or in the only namespace with it; or empty."""
     relative = name.removeprefix("~").strip("/")
     for candidate in (name, f"/{relative}", relative):
@@ -107,7 +111,7 @@ def _find(reader: BagReader, name: str) -> str:
 
 
 def _require(reader: BagReader, bag: Path, name: str, types: tuple[str, ...], remedy: str, instead: str = "") -> str:
-    topic = _find(reader, name)
+    topic = find_topic(reader, name)
     if topic and reader.topics[topic].type in types and reader.topics[topic].count:
         return topic
     if not topic:

@@ -141,6 +141,16 @@ def test_a_topic_without_messages(command: Command, tmp_path: Path, minute: Topi
     assert "topic imu/data has no messages" in command.fails(bag)
 
 
+def test_an_optional_topic_without_messages_is_told_and_left_out(
+    command: Command, tmp_path: Path, minute: Topics
+) -> None:
+    type_name, log_time, messages = minute["gps/vel"]
+    bag = write_bag(tmp_path / "b.mcap", minute | {"gps/vel": (type_name, log_time[:0], messages[:0])})
+    code, _, error = command(bag, "--quiet")
+    assert code == 0
+    assert "topic gps/vel has no messages; the recording is replayed without it" in error
+
+
 def test_wrong_topic_names_list_what_is_there_and_the_key_to_set(
     command: Command, tmp_path: Path, minute: Topics
 ) -> None:

@@ -36,7 +36,7 @@ FLOORS = (
     ("filter.navigator",),
     ("filter.warm_up", "inputs"),
     ("replay", "simulate"),
-    ("tables",),
+    ("tables", "doctor"),
     ("api",),
     ("ros_node",),
 )
