@@ -127,6 +127,12 @@ def kind_of(stream):
 
 
 @njit
+def receiver_of(aid):
+    """Return the index of the receiver of a message; the source of a range is its satellite, of the first receiver."""
+    return 0 if aid.stream in (Stream.PSEUDORANGE, Stream.RANGE_RATE) else aid.source
+
+
+@njit
 def other_stream(stream):
     """Return the stream of the other kind of the same receiver: velocities for positions, positions for velocities."""
     if stream == Stream.GNSS_POSITION:
@@ -182,7 +188,7 @@ def hear(states, aid, gate, settings, work):
     its innovation.
     """
     state, humble = states[FILTER], states[HUMBLE]
-    kind, source = kind_of(aid.stream), aid.source
+    kind, source = kind_of(aid.stream), receiver_of(aid)
     size = linearize(humble, aid, settings, work)
     if aid.stream == Stream.GNSS_POSITION and reset_jumped_error(states, settings, work):
         linearize(humble, aid, settings, work)
@@ -258,7 +264,7 @@ def note_jump(state, aid, kind, work):
     receiver that has stepped aside; offsets that grow come from an IMU that goes astray, unless the velocities of the
     same receiver agree with the IMU.
     """
-    trust, source = state.trust, aid.source
+    trust, source = state.trust, receiver_of(aid)
     # Without a heading the velocity comes from the same receiver: nothing backs the IMU.
     is_backed = state.heading_known == 1 and is_other_agreeing(state, aid.stream, source)
     dt = (aid.stamp - trust.refused_stamp[kind, source]) * 1e-9
@@ -361,7 +367,7 @@ def weigh_evidence(states, aid, nis, log_determinant, humble_nis, humble_log_det
     """
     state = states[FILTER]
     update_doubt(state)
-    if kind_of(aid.stream) == 1 or not is_live(state, other_stream(aid.stream), aid.source):
+    if kind_of(aid.stream) == 1 or not is_live(state, other_stream(aid.stream), receiver_of(aid)):
         ratio = min(nis, LARGEST_NIS) + log_determinant - min(humble_nis, LARGEST_NIS) - humble_log_determinant
         state.trust.evidence = max(0.0, state.trust.evidence + 0.5 * ratio)
     return state.trust.evidence >= EVIDENCE or is_heading_apart(states, settings)
