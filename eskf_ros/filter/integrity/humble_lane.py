@@ -93,6 +93,11 @@ SHORT_PATIENCE = 1_000_000_000
 LONG_PATIENCE = 30_000_000_000
 """ns; a stream that stepped aside is believed after this time at the latest."""
 
+SOLUTION_SCALE = (25.0, 9.0)
+"""Factor on the covariance of the solution of an epoch of ranges and of range rates: signals err for minutes and
+together, which least squares over one epoch do not know.
+"""
+
 LOST_HEADING_STD = 0.5
 """rad; a humble lane that knows the heading no better starts anew from the filter."""
 
@@ -172,7 +177,7 @@ def linearize(lane, aid, settings, work):
     measured = (work.solution[0], work.solution[1], work.solution[2])
     for i in range(3):
         for j in range(3):
-            work.noise[i, j] = work.solution_covariance[i, j]
+            work.noise[i, j] = SOLUTION_SCALE[kind_of(aid.stream)] * work.solution_covariance[i, j]
     if aid.stream == Stream.PSEUDORANGE:
         gnss_position.linearize_antenna(lane, measured, 0, settings, work)
     else:
