@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from eskf_ros.filter.history.records import AID
-from eskf_ros.filter.integrity.recovery import reset_for_new_solution
+from eskf_ros.filter.integrity.receiver import reset_for_new_solution
 from eskf_ros.filter.measurements import gnss_position
 from eskf_ros.filter.measurements.kalman_update import update
 from eskf_ros.filter.navigator import Navigator

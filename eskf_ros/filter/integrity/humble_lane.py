@@ -45,6 +45,7 @@ TRUST = np.dtype(
         ("refused_stamp", "i8", (2, SOURCES)),
         ("refused_innovation", "f8", (2, SOURCES, 3)),
         ("first_innovation", "f8", (2, SOURCES, 3)),
+        ("change", "f8", (2, SOURCES, 3)),
         ("jumps", "i8", (2, SOURCES)),
         ("jump", "f8", (2, SOURCES)),
     ],
@@ -57,6 +58,7 @@ TRUST = np.dtype(
 - ``takeovers``: how often the humble lane took over.
 - ``refused``, ``refused_since``, ``refused_stamp``: messages refused in a row, the first and the last of them (ns).
 - ``refused_innovation``, ``first_innovation``: innovation of the last and of the first refused one (m or m/s, map).
+- ``change``: largest change from one refused innovation to the next (m or m/s, map).
 - ``jumps``, ``jump``: how often a stream jumped, and the furthest (m or m/s).
 """
 
@@ -84,7 +86,7 @@ LEAST_JUMP = (2.0, 0.5)
 AGREEMENT_GATE = 16.27
 """NIS of the difference of two refused messages up to which they agree: the chi-square quantile of 0.999."""
 
-FEWEST = 4
+FEWEST = 5
 """Refused messages in a row that must agree with each other before they are believed."""
 
 SHORT_PATIENCE = 1_000_000_000
@@ -209,7 +211,7 @@ def hear(states, aid, gate, settings, work):
             return True, False, nis, 0.0
         linearize(humble, aid, settings, work)
         is_inertial = kind == 1 or not is_other_agreeing(state, aid.stream, source)
-        reset_to_message(humble, aid, is_inertial, work)
+        reset_to_message(humble, state.trust, aid, is_inertial, work)
         size = linearize(humble, aid, settings, work)
         nis, determinant = judge(humble, size, work)
         believed = True
@@ -290,23 +292,29 @@ def note_jump(state, aid, kind, work):
         trust.refused_since[kind, source] = aid.stamp
         for i in range(3):
             trust.first_innovation[kind, source, i] = work.innovation[i]
+            trust.change[kind, source, i] = 0.0
+            trust.refused_innovation[kind, source, i] = work.innovation[i]
     trust.refused[kind, source] += 1
     trust.refused_stamp[kind, source] = aid.stamp
     square = 0.0
     for i in range(3):
+        change = abs(work.innovation[i] - trust.refused_innovation[kind, source, i])
+        trust.change[kind, source, i] = max(trust.change[kind, source, i], change)
         trust.refused_innovation[kind, source, i] = work.innovation[i]
         square += work.innovation[i] ** 2
     trust.jump[kind, source] = max(trust.jump[kind, source], math.sqrt(square))
     lasted = aid.stamp - trust.refused_since[kind, source]
-    is_apart = stays > AGREEMENT_GATE or is_other_refused(state, aid.stream, source) or state.heading_known == 0
+    is_alone = not is_live(state, other_stream(aid.stream), source)
+    is_apart = is_alone and stays > AGREEMENT_GATE
+    is_apart = is_apart or is_other_refused(state, aid.stream, source) or state.heading_known == 0
     patience = SHORT_PATIENCE if is_apart else patience_for(state, aid.stream, source)
     return trust.refused[kind, source] >= FEWEST and lasted >= patience
 
 
 @njit
 def is_other_refused(state, stream, source):
-    """Say whether the other kind of message of a receiver contradicts the humble lane, too: then the IMU is wrong."""
-    return is_live(state, other_stream(stream), source) and state.trust.refused[1 - kind_of(stream), source] > 0
+    """Say whether the other kind of message of a receiver contradicts the lanes for as long: then the IMU is wrong."""
+    return is_live(state, other_stream(stream), source) and state.trust.refused[1 - kind_of(stream), source] >= FEWEST
 
 
 @njit
@@ -326,11 +334,12 @@ def patience_for(state, stream, source):
 
 
 @njit
-def reset_to_message(lane, aid, is_inertial, work):
+def reset_to_message(lane, trust, aid, is_inertial, work):
     """Open what a message contradicts, which is believed now; ``work`` holds its innovation and noise.
 
     A position moves the position, and where the IMU is at fault (``is_inertial``) opens the velocity. A velocity moves
-    the velocity. A fault of the IMU also opens the attitude and the biases.
+    the velocity. Both are as good as the refused messages agree (``trust``). A fault of the IMU also opens the attitude
+    and the biases.
     """
     kind = kind_of(aid.stream)
     block = POSITION if kind == 0 else VELOCITY
@@ -340,7 +349,8 @@ def reset_to_message(lane, aid, is_inertial, work):
             lane.position_map[i] += work.innovation[i]
         else:
             lane.velocity_map[i] += work.innovation[i]
-        lane.covariance[block + i, block + i] = 4.0 * work.noise[i, i]
+        change = trust.change[kind, receiver_of(aid), i]
+        lane.covariance[block + i, block + i] = 4.0 * work.noise[i, i] + change * change
     if not is_inertial:
         return
     if kind == 0:

@@ -99,7 +99,7 @@ def fuse_receiver(states, aid, gate, settings, work):
         update_weighed_down(state, size, aid.nis / gate, work)
         aid.verdict = Verdict.WEIGHED_DOWN
     elif note_jump(state, aid, kind_of(aid.stream), work):
-        reset_to_message(state, aid, True, work)
+        reset_to_message(state, state.trust, aid, True, work)
         linearize(state, aid, settings, work)
         update(state, size, math.inf, work)
         believed = True
