@@ -296,7 +296,7 @@ class Gnss:
         "Share of the variance of each fix that lasts; the rest is new every time. 0: learned from what the fixes "
         "claim and how much they scatter.",
         minimum=0.0,
-        below=1.0,
+        maximum=0.99,
         live=True,
     )
     status_std_horizontal: tuple[float, ...] = parameter(
