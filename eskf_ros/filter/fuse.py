@@ -11,11 +11,11 @@ from eskf_ros.filter.alignment.levelling import reset_level_to_moving
 from eskf_ros.filter.history.timeline import open_record
 from eskf_ros.filter.inertial.navigation_frame import heading_of
 from eskf_ros.filter.integrity.heading_monitor import watch_course, watch_field, watch_heading
-from eskf_ros.filter.integrity.humble_lane import kind_of
 from eskf_ros.filter.integrity.installation_monitor import find_faults, learn_faults
 from eskf_ros.filter.integrity.receiver import fuse_receiver, reset_for_new_solution
 from eskf_ros.filter.integrity.receiver_monitor import watch_receiver
 from eskf_ros.filter.integrity.recovery import note, recover
+from eskf_ros.filter.integrity.refusal import kind_of
 from eskf_ros.filter.integrity.repeated_fixes import is_repeated, note_copy, note_fused_fix
 from eskf_ros.filter.measurements import (
     baro,

@@ -7,7 +7,7 @@ from eskf_ros.filter.alignment.levelling import update_level
 from eskf_ros.filter.fuse import fuse
 from eskf_ros.filter.history.timeline import rewind, save_checkpoint
 from eskf_ros.filter.inertial.navigation_frame import heading_of
-from eskf_ros.filter.inertial.sample_quality import judge_sample
+from eskf_ros.filter.inertial.sample_quality import copy_doubt, judge_sample
 from eskf_ros.filter.inertial.stamps import take_stamp
 from eskf_ros.filter.inertial.strapdown import SMOOTHING_TIME
 from eskf_ros.filter.integrity.imu_monitor import watch_input, watch_interval
@@ -15,7 +15,7 @@ from eskf_ros.filter.integrity.restart import reset_alignment
 from eskf_ros.filter.output.global_odometry import write_odometry
 from eskf_ros.filter.output.local_odometry import carry, measure_step, note_jump
 from eskf_ros.filter.predict import propagate
-from eskf_ros.filter.state.lanes import FILTER, HUMBLE
+from eskf_ros.filter.state.lanes import FILTER, HUMBLE, is_running
 from eskf_ros.filter.state.time import NEVER, SECOND
 from eskf_ros.filter.stationarity.detector import add_to_block
 from eskf_ros.filter.stationarity.residual_motion import add_to_part
@@ -48,7 +48,8 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
 
         predict(states, instant, sample, instant, settings, work)
         take_sample(state, sample, instant)
-        states[HUMBLE].imu.interval = state.imu.interval
+        if is_running(states):
+            take_sample(states[HUMBLE], sample, instant)
         watch_interval(state, settings)
         measure_step(state, settings)
         update_rest(state, settings)
@@ -83,7 +84,10 @@ def predict(states, stamp, sample, instant, settings, work):
         reset_alignment(state)
         note_jump(state, position, heading_of(state, settings), settings)
         return
-    propagate(states, stamp, sample, instant, settings, work)
+    propagate(state, stamp, sample, instant, settings, work)
+    if is_running(states):
+        copy_doubt(state, states[HUMBLE])
+        propagate(states[HUMBLE], stamp, sample, instant, settings, work)
 
 
 @njit

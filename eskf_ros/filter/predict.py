@@ -13,7 +13,6 @@ from eskf_ros.filter.inertial.covariance import (
 from eskf_ros.filter.inertial.strapdown import propagate_nominal_state
 from eskf_ros.filter.state import augmented_states
 from eskf_ros.filter.state.error_state import ERROR_SIZE
-from eskf_ros.filter.state.lanes import FILTER, HUMBLE, LANES, is_running
 from eskf_ros.filter.state.time import SECOND
 from eskf_ros.geodesy.rotation import dot
 
@@ -33,11 +32,10 @@ WANDER_TIME = 1.0
 
 
 @njit
-def step(state, quality, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
+def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
     """Propagate one lane by ``dt`` s between two raw IMU readings (m/s2, rad/s; IMU axes).
 
-    ``quality`` says which axes are doubted (`inertial.sample_quality`). ``gap`` (s) is the length of the hole in
-    the IMU data that is being bridged, 0 for none.
+    ``gap`` (s) is the length of the hole in the IMU data that is being bridged, 0 for none.
     """
     # With an unknown heading the direction of the measured acceleration on the map is unknown: it is not integrated.
     coupling = 0.0 if state.heading_known == 0 else 1.0
@@ -54,8 +52,8 @@ def step(state, quality, force_0, rate_0, force_1, rate_1, dt, gap, settings, wo
     force = credible_force(state.excitation, covariance, middle, force, gravity, dt, settings.accel_noise_density)
     propagate_covariance(covariance, size, middle, force, gravity, state.frame.earth_rate_map, dt, coupling, work)
     propagate_noise(covariance, velocity_noise, attitude_noise, accel_walk, gyro_walk, dt)
-    if quality.is_doubted == 1:
-        propagate_axis_noise(covariance, middle, quality.doubt, dt)
+    if state.quality.is_doubted == 1:
+        propagate_axis_noise(covariance, middle, state.quality.doubt, dt)
     if size > ERROR_SIZE:
         augmented_states.propagate_augmented(state, dt, settings)
 
@@ -86,14 +84,13 @@ def between_noise(told, humble, doubt):
 
 
 @njit
-def propagate(states, stamp, sample, instant, settings, work):
-    """Propagate the lanes to ``stamp`` (ns), at or before ``instant`` (ns), the time of the next ``sample``.
+def propagate(state, stamp, sample, instant, settings, work):
+    """Propagate one lane to ``stamp`` (ns), at or before ``instant`` (ns), the time of the next ``sample``.
 
     Between two samples the IMU is the straight line whose mean is that of the parabola through them and the sample
     before (Adams-Moulton): an interval gives the same result wherever it is cut. A long interval is integrated in
     steps; one longer than the gap of the settings may hide motion and adds process noise.
     """
-    state = states[FILTER]
     interval = (instant - state.imu.stamp) / SECOND
     force_0, force_1 = line(state.imu.earlier_force, state.imu.force, sample.specific_force, interval, state, settings)
     rate_0, rate_1 = line(state.imu.earlier_rate, state.imu.rate, sample.angular_rate, interval, state, settings)
@@ -103,24 +100,19 @@ def propagate(states, stamp, sample, instant, settings, work):
     end = (stamp - state.imu.stamp) / SECOND / interval
     force_a = between(force_0, force_1, begin)
     rate_a = between(rate_0, rate_1, begin)
-    dt = (end - begin) * interval / max(steps, 1)
-    humble = is_running(states)
     for k in range(steps):
         fraction = begin + (end - begin) * (k + 1) / steps
         force_b = between(force_0, force_1, fraction)
         rate_b = between(rate_0, rate_1, fraction)
-        step(state, state.quality, force_a, rate_a, force_b, rate_b, dt, gap, settings, work)
-        if humble:
-            step(states[HUMBLE], state.quality, force_a, rate_a, force_b, rate_b, dt, gap, settings, work)
+        step(state, force_a, rate_a, force_b, rate_b, (end - begin) * interval / steps, gap, settings, work)
         force_a = force_b
         rate_a = rate_b
     force = between(state.imu.force, sample.specific_force, end)
     rate = between(state.imu.rate, sample.angular_rate, end)
-    for lane in range(LANES):
-        for i in range(3):
-            states[lane].specific_force[i] = force[i]
-            states[lane].angular_rate[i] = rate[i]
-        states[lane].stamp = stamp
+    for i in range(3):
+        state.specific_force[i] = force[i]
+        state.angular_rate[i] = rate[i]
+    state.stamp = stamp
 
 
 @njit

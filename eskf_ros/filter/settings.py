@@ -16,7 +16,7 @@ from eskf_ros.filter.state.error_state import ERROR_SIZE, NOWHERE, OPTIONAL_SIZE
 from eskf_ros.filter.state.memory import allocate
 from eskf_ros.filter.state.time import SECOND
 from eskf_ros.geodesy.earth import east_north_up_to_ecef, geodetic_to_ecef
-from eskf_ros.parameters.tree import Parameters
+from eskf_ros.parameters.tree import Imu, Parameters
 
 SWITCHED_ON_SHARE = 0.1
 """Share of its initial standard deviation by which a bias changes when the IMU is switched off and on, at another
@@ -60,23 +60,7 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
     """
     settings = allocate(SETTINGS)
     imu, alignment = parameters.imu, parameters.alignment
-    for name in (
-        "gyro_noise_density",
-        "accel_noise_density",
-        "gyro_bias_random_walk",
-        "accel_bias_random_walk",
-        "gyro_bias_std",
-        "accel_bias_std",
-    ):
-        settings[name] = getattr(imu, name)
-    told = (
-        imu.accel_noise_density,
-        imu.gyro_noise_density,
-        imu.accel_bias_random_walk,
-        imu.gyro_bias_random_walk,
-    )
-    settings["imu_noise"] = np.square(told)
-    settings["humble_noise"] = np.square(np.maximum(HUMBLE_NOISE, np.multiply(told, (4.0, 4.0, 1.0, 1.0))))
+    describe_imu_noise(settings, imu)
     settings["has_humble_lane"] = 1
     settings["imu_gap"] = imu.gap
     settings["gap_accel_std"] = imu.gap_accel_std
@@ -118,6 +102,27 @@ def settings_from(parameters: Parameters, output_rate: float = 0.0) -> np.ndarra
         settings[f"quality_{name}"] = getattr(parameters.quality, name)
     settings["output_interval"] = round(SECOND / output_rate) if output_rate > 0.0 else 0
     return settings
+
+
+def describe_imu_noise(settings: np.ndarray, imu: Imu) -> None:
+    """Write the noise of the IMU to the settings, as told and for the humble lane."""
+    for name in (
+        "gyro_noise_density",
+        "accel_noise_density",
+        "gyro_bias_random_walk",
+        "accel_bias_random_walk",
+        "gyro_bias_std",
+        "accel_bias_std",
+    ):
+        settings[name] = getattr(imu, name)
+    told = (
+        imu.accel_noise_density,
+        imu.gyro_noise_density,
+        imu.accel_bias_random_walk,
+        imu.gyro_bias_random_walk,
+    )
+    settings["imu_noise"] = np.square(told)
+    settings["humble_noise"] = np.square(np.maximum(HUMBLE_NOISE, np.multiply(told, (4.0, 4.0, 1.0, 1.0))))
 
 
 def place_optional_states(settings: np.void, parameters: Parameters) -> None:

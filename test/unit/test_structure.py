@@ -50,9 +50,9 @@ WRITERS = {
     "inertial/covariance.py": {"propagate_noise", "propagate_axis_noise", "propagate_covariance", "update_error_axes"},
     "inertial/navigation_frame.py": {"reset_attitude", "reset_datum"},
     "inertial/strapdown.py": {"propagate_nominal_state"},
-    "integrity/fix_tracker.py": {"inflate_position_for_scatter"},
-    "integrity/recovery.py": {"reset_to_fixes", "reset_error"},
+    "integrity/humble_lane.py": {"reset_block", "reset_to_humble_lane", "reset_to_message"},
     "integrity/restart.py": {"reset_alignment"},
+    "integrity/scatter.py": {"inflate_lasting_error"},
     "measurements/kalman_update.py": {"update_covariance", "update_nominal_state"},
     "measurements/mag.py": {"propagate_mag_error"},
     "state/augmented_states.py": {"reset_augmented", "propagate_augmented", "propagate_clock"},
@@ -60,6 +60,9 @@ WRITERS = {
     "tight/receiver_clock.py": {"reset_clock", "reset_or_jump_clock"},
 }
 """All functions that assign to position, velocity, attitude, biases, augmented states or their covariance."""
+
+LANES = ("state", "lane", "humble")
+"""Names by which functions call the record that holds an estimate."""
 
 ESTIMATE = {"position_map", "velocity_map", "attitude", "accel_bias", "gyro_bias", "optional", "covariance"}
 
@@ -131,7 +134,11 @@ def root_of(node: ast.expr) -> ast.expr:
 def field_of(node: ast.expr) -> str:
     """The field of the estimate that an expression is, or is a part of; empty for all else."""
     root = root_of(node)
-    if isinstance(root, ast.Attribute) and isinstance(root.value, ast.Name) and root.value.id == "state":
+    if (
+        isinstance(root, ast.Attribute)
+        and isinstance(root.value, ast.Name)
+        and root.value.id in ("state", "lane", "humble")
+    ):
         return root.attr if root.attr in ESTIMATE else ""
     return ""
 

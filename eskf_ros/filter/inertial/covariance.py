@@ -76,6 +76,7 @@ def acceleration_variance(covariance, rotation, force):
                 total += row[i] * row[j] * covariance[ATTITUDE + i, ATTITUDE + j]
     return 0.5 * total
 
+
 UNKNOWN_ATTITUDE = 1.0
 """rad; standard deviation of an attitude that is as good as unknown."""
 

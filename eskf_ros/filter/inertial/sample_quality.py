@@ -134,6 +134,14 @@ LONGEST_SHOCK = 0.5
 
 
 @njit
+def copy_doubt(state, lane):
+    """Let another lane know which axes of the interval are doubted."""
+    lane.quality.is_doubted = state.quality.is_doubted
+    for i in range(6):
+        lane.quality.doubt[i] = state.quality.doubt[i]
+
+
+@njit
 def judge_sample(state, sample, instant, settings):
     """Compare the next IMU sample, of the time ``instant`` (ns), with those before; set the doubt about the interval.
 

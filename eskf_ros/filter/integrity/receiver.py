@@ -15,17 +15,15 @@ from eskf_ros.compiled import njit
 from eskf_ros.filter.history.records import XX, YY
 from eskf_ros.filter.integrity.heading_corrections import HEADING, forget_corrections, weigh_correction
 from eskf_ros.filter.integrity.humble_lane import (
-    JUMP_GATE,
     hear,
-    kind_of,
     linearize,
-    note_jump,
     reset_to_humble_lane,
     reset_to_message,
     start,
     weigh_evidence,
 )
 from eskf_ros.filter.integrity.recovery import note, note_reset
+from eskf_ros.filter.integrity.refusal import JUMP_GATE, kind_of, note_jump
 from eskf_ros.filter.integrity.scatter import (
     copy_scatter,
     forget_scatter,
