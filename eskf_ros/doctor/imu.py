@@ -285,7 +285,8 @@ def _wandering_findings(samples: Sensor, seconds: Seconds) -> list[Finding]:
     first, last = (np.median(seconds.mean[part, 3:], axis=0) for part in (rests[:3], rests[-3:]))
     change = float(np.linalg.norm(last - first))
     span = float((seconds.stamp[rests[-1]] - seconds.stamp[rests[0]]) * 1e-9)
-    if change < WANDERING:
+    noise = float(np.linalg.norm(np.std(np.diff(seconds.mean[rests, 3:], axis=0), axis=0))) / math.sqrt(2.0)
+    if change < max(WANDERING, 5.0 * noise):
         return []
     wanted = min(0.1, float(f"{change / math.sqrt(max(span, 1.0)):.1g}"))
     text = (
