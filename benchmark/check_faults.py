@@ -66,7 +66,7 @@ NAMES = {
     "position drawn away by 0.5 m/s": ("position_drawn_away", "position_steps"),
     "frozen coordinates for 40 s": ("frozen_fixes",),
 }
-"""Findings by which a fault of `faults.py` counts as named; "filter: WORD": a sentence of the monitors with the word."""
+"""Findings by which a fault of `faults.py` counts as named; "filter: WORD": a sentence of the monitors with it."""
 
 SEVERITIES = {Severity.NOTE: "note", Severity.WARNING: "warning", Severity.ERROR: "error"}
 

@@ -31,8 +31,9 @@ def filter_findings(
     is_explained = any(finding.severity >= Severity.WARNING for finding in known)
     said = [line for line in summary["warnings"] if str(recording.path) not in line and "no GNSS velocity" not in line]
     severity = Severity.NOTE if is_explained else Severity.WARNING
-    # What the navigator notes of streams, though nothing is wrong, stands among its warnings.
-    found = [_finding(line, Severity.NOTE if " came without " in line else severity) for line in said]
+    # What is noted of streams, though nothing is wrong, stands among the warnings.
+    facts = (" came without ", " has no messages; ")
+    found = [_finding(line, Severity.NOTE if any(fact in line for fact in facts) else severity) for line in said]
     status = Status[summary["final"]["status"]]
     if summary["final"]["position"] is None:
         text = f"the estimator found no position; it ends in {status.name}"
