@@ -56,7 +56,7 @@ WIND = 5.0
 LEAST_LENGTH = 0.5
 """Length of the found (cos, sin) along the course, at least; 1 if the model holds."""
 
-COURSE_SEARCH_STD = 0.175
+COURSE_SEARCH_STD = 0.2
 """rad; standard deviation of the direction found by the search above which the course is not believed."""
 
 

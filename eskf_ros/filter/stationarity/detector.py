@@ -300,8 +300,11 @@ def is_resting(state, settings):
 def update_rest_evidence(state, aid):
     """Look for rest or motion in a measurement of any sensor, whatever the filter will make of it.
 
-    Returns whether it disproves the last level (`static_window.update_motion`).
+    Returns whether it disproves the last level (`static_window.update_motion`). What comes before the first IMU sample
+    says nothing of a robot whose IMU is quiet.
     """
+    if state.imu.stamp == NEVER:
+        return False
     p = aid.payload
     if aid.stream == Stream.GNSS_POSITION:
         fix = geodetic_to_ecef(p[0], p[1], p[2])
