@@ -32,11 +32,15 @@ from eskf_ros.geodesy.rotation import dot, rotate
 ACCELERATION_TIME = 1.0
 """s; time constant of the mean acceleration that `credible_force` judges. Vehicles accelerate for about so long."""
 
-CREDIBLE = 3.0
-"""Standard deviations (per axis) of the mean acceleration below which none of it is believed; of noise 1 % is above."""
+CREDIBLE = 5.0
+"""Standard deviations (per axis) that the mean acceleration must exceed to be believed; noise alone never does."""
 
-EXCITATION = np.dtype([("acceleration", "f8", (3,))], align=True)
-"""Horizontal acceleration (m/s2, map), low-passed with `ACCELERATION_TIME`."""
+EXCITED_TIME = 20.0
+"""s; after an acceleration that was believed, those that follow are part of the same motion."""
+
+EXCITATION = np.dtype([("acceleration", "f8", (3,)), ("left", "f8")], align=True)
+"""``acceleration``: horizontal (m/s2, map), low-passed with `ACCELERATION_TIME`; ``left``: seconds for which
+accelerations are believed."""
 
 
 @njit
@@ -44,23 +48,25 @@ def credible_force(excitation, covariance, rotation, force, gravity, dt, noise_d
     """Return the specific force (m/s2, map) of the error dynamics, and advance `EXCITATION` by ``dt`` s.
 
     A horizontal acceleration turns an error of the heading into one of the velocity: it shows the heading. So do, in
-    F, the noise of the accelerometer and an error of tilt or bias, though the robot stands still; the heading would
-    grow certain of nothing. Therefore the horizontal part of ``force`` is scaled by 1 - (k s / a)^2, or zero: a is the
-    low-passed horizontal acceleration, s its standard deviation from white noise (``noise_density``, m/s2/rtHz; Gelb,
-    section 3.8) and from the covariance, k `CREDIBLE`. Far from the datum s is about the horizontal of map, a few
-    degrees off.
+    F, the noise of the accelerometer and an error of tilt or bias, though the robot stands still or travels straight
+    on; the heading would grow certain of nothing. Therefore ``force`` has a horizontal part only for `EXCITED_TIME`
+    after the low-passed horizontal acceleration has exceeded `CREDIBLE` standard deviations from white noise
+    (``noise_density``, m/s2/rtHz; Gelb, section 3.8) and from the covariance. Far from the datum these are about the
+    horizontal of map, a few degrees off.
     """
     along = dot(force, gravity) / dot(gravity, gravity)
     vertical = (along * gravity[0], along * gravity[1], along * gravity[2])
-    level = (force[0] - vertical[0], force[1] - vertical[1], force[2] - vertical[2])
     mean = excitation.acceleration
     for i in range(3):
-        mean[i] += dt / ACCELERATION_TIME * (level[i] - mean[i])
+        mean[i] += dt / ACCELERATION_TIME * (force[i] - vertical[i] - mean[i])
     square = mean[0] * mean[0] + mean[1] * mean[1] + mean[2] * mean[2]
     noise = noise_density**2 / (2.0 * ACCELERATION_TIME)
-    doubted = CREDIBLE**2 * (noise + acceleration_variance(covariance, rotation, vertical))
-    share = 1.0 - doubted / square if square > doubted else 0.0
-    return (vertical[0] + share * level[0], vertical[1] + share * level[1], vertical[2] + share * level[2])
+    excitation.left = max(0.0, excitation.left - dt)
+    if square > CREDIBLE**2 * noise and square > CREDIBLE**2 * (
+        noise + acceleration_variance(covariance, rotation, vertical)
+    ):
+        excitation.left = EXCITED_TIME
+    return force if excitation.left > 0.0 else vertical
 
 
 @njit
