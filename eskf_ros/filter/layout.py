@@ -119,7 +119,6 @@ SETTINGS = np.dtype(
         ("accel_noise_density", "f8"),
         ("gyro_bias_random_walk", "f8"),
         ("accel_bias_random_walk", "f8"),
-        ("imu_noise", "f8", (4,)),
         ("humble_noise", "f8", (4,)),
         ("has_humble_lane", "i8"),
         ("gyro_bias_std", "f8"),
@@ -176,7 +175,7 @@ SETTINGS = np.dtype(
 )
 """Parameters as the kernels use them: radians, body axes, innovation gates by stream and degrees of freedom.
 
-``imu_noise``, ``humble_noise``: spectral densities as told and for the humble lane (`predict.imu_noise`);
+``humble_noise``: spectral densities of the humble lane (`predict.imu_noise`);
 ``has_humble_lane``: 1, but 0 where a campaign compares with a filter that trusts itself.
 ``reach``: errors that must be active for a measurement of a stream. ``constrains``: which constraints are switched on.
 ``needs``: what must be known before a measurement of a stream is fused. ``NAME_at``: index of an augmented state, or

@@ -64,9 +64,15 @@ def imu_noise(doubt, settings):
 
     They are those of the parameters for the ``doubt`` 0, those of the humble lane for 1, and geometric means between.
     """
-    told, humble = settings.imu_noise, settings.humble_noise
+    told = (
+        settings.accel_noise_density**2,
+        settings.gyro_noise_density**2,
+        settings.accel_bias_random_walk**2,
+        settings.gyro_bias_random_walk**2,
+    )
+    humble = settings.humble_noise
     if doubt == 0.0:
-        return told[0], told[1], told[2], told[3]
+        return told
     if doubt == 1.0:
         return humble[0], humble[1], humble[2], humble[3]
     return (

@@ -121,7 +121,6 @@ def describe_imu_noise(settings: np.ndarray, imu: Imu) -> None:
         imu.accel_bias_random_walk,
         imu.gyro_bias_random_walk,
     )
-    settings["imu_noise"] = np.square(told)
     settings["humble_noise"] = np.square(np.maximum(HUMBLE_NOISE, np.multiply(told, (4.0, 4.0, 1.0, 1.0))))
 
 

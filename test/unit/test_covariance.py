@@ -310,24 +310,22 @@ def test_an_acceleration_that_may_be_tilt_does_not_show_the_heading(known: bool)
     assert 0.35 < shown < 0.6 if known else shown == 0.0
 
 
-def test_small_share_of_a_mean_acceleration_at_the_edge() -> None:
-    """The share grows from zero at three standard deviations towards one: there is no step."""
-    noise, gravity = 0.03, (0.0, 0.0, -9.81)
-    edge = 3.0 * noise / np.sqrt(2.0)
-    excitation = make_state()["excitation"]
-    shares = []
-    for factor in (0.99, 1.01, 3.0, 30.0):
-        level = factor * edge
-        excitation["acceleration"] = (level, 0.0, 0.0)
-        force = kernel.credible_force(
-            excitation,
-            np.zeros((15, 15)),
-            ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-            (level, 0.0, 9.81),
-            gravity,
-            0.01,
-            noise,
-        )
-        assert force[2] == pytest.approx(9.81)
-        shares.append(force[0] / level)
-    np.testing.assert_allclose(shares, [0.0, 1.0 - 1.01**-2, 1.0 - 1.0 / 9.0, 1.0 - 1.0 / 900.0], rtol=1e-9, atol=0.0)
+def test_accelerations_are_believed_for_a_while_after_one_that_stands_out() -> None:
+    """Beyond five standard deviations of the noise, and twenty seconds from then on."""
+    noise, level = 0.03, (1.0, 0.0, 0.0)
+    edge = 5.0 * noise / np.sqrt(2.0)
+    for factor, seconds in ((0.99, 0.0), (1.01, kernel.EXCITED_TIME)):
+        excitation = make_state()["excitation"]
+        excitation["acceleration"] = (factor * edge, 0.0, 0.0)
+        believed = 0
+        for _ in range(2500):
+            if believed == 0:
+                excitation["acceleration"] = (factor * edge, 0.0, 0.0)
+            axes = (level, (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+            force = kernel.credible_force(
+                excitation, np.zeros((15, 15)), axes, (1e-3, 0.0, 9.81), (0.0, 0.0, -9.81), 0.01, noise
+            )
+            assert force[2] == pytest.approx(9.81)
+            believed += force[0] != 0.0
+        assert believed * 0.01 == pytest.approx(seconds, abs=0.1)
+

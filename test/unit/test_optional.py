@@ -57,9 +57,9 @@ def joined(seed: int) -> Any:
 
 
 def test_nothing_is_in_use_by_default() -> None:
-    """But for what wheels need, once there are any."""
+    """But for what wheels need, once there are any, and the lasting error of fixes, once they show one."""
     plain = make_settings()
-    assert plain["position_error_at"] == NOWHERE
+    assert make_settings(gnss__correlation_time=0.0)["position_error_at"] == NOWHERE
     assert (plain["reach"][[Stream.GNSS_POSITION, Stream.GNSS_VELOCITY]] == ERROR_SIZE).all()
 
 
@@ -221,9 +221,16 @@ def with_lasting_errors(recording: Recording, std: float, share: float, seed: in
 
 
 def test_the_covariance_stays_honest_when_errors_of_the_fixes_last() -> None:
-    """Ten fixes per second that err alike for a minute: without the model the filter is far too sure of itself."""
+    """Ten fixes per second that err alike for a minute: without the model the filter is far too sure of itself.
+
+    By default it learns the share that lasts.
+    """
     means = {}
-    for name, changes in (("model", {"gnss.correlation_time": TIME, "gnss.correlated_share": 0.7}), ("none", {})):
+    for name, changes in (
+        ("model", {"gnss.correlation_time": TIME, "gnss.correlated_share": 0.7}),
+        ("learned", {}),
+        ("none", {"gnss.correlation_time": 0.0}),
+    ):
         values = []
         for seed in range(4):
             drive = simulate("drive", seed, imu_rate=50.0, gnss_rate=10.0, position_std=(1e-4, 1e-4), stop=120.0)
@@ -234,6 +241,7 @@ def test_the_covariance_stays_honest_when_errors_of_the_fixes_last() -> None:
             values.append(nees(result.error[settled], result.covariance[settled], slice(0, 3)).mean())
         means[name] = np.mean(values)
     assert 1.5 < means["model"] < 5.0, means
+    assert 1.5 < means["learned"] < 5.0, means
     assert means["none"] > 12.0, means
 
 

@@ -17,6 +17,7 @@ from eskf_ros.filter.history.records import AID
 from eskf_ros.filter.inertial.strapdown import gravity_map
 from eskf_ros.filter.measurements.kalman_update import invert_positive, update, update_nominal_state
 from eskf_ros.filter.state.enums import Stream, Verdict
+from eskf_ros.filter.layout import blank_state
 from eskf_ros.filter.state.memory import allocate
 from support.kernels import (
     USUAL_STDS,
@@ -250,9 +251,12 @@ def test_without_an_innovation_covariance_the_monitors_learn_nothing() -> None:
     aid["stream"], aid["stamp"], aid["verdict"] = Stream.GNSS_POSITION, state["stamp"], Verdict.WAITING
     aid["payload"][:3] = (0.84, 0.2, 565.0)
     aid["payload"][[3, 6, 8]] = 1.0
-    fuse(state, aids, 0, settings, make_work())
+    states = blank_state()
+    states[0] = state
+    fuse(states, aids, 0, settings, make_work())
+    state = states[0]
     assert aid["verdict"] == Verdict.BAD_COVARIANCE
-    assert np.isfinite(state["receiver"]["fault_information"]).all()
-    assert np.isfinite(state["receiver"]["fault_evidence"]).all()
+    assert np.isfinite(state["installation"]["information"]).all()
+    assert np.isfinite(state["installation"]["evidence"]).all()
     assert np.isfinite(state["receiver"]["drift_sums"]).all()
-    assert not state["receiver"]["fault_information"].any()
+    assert not state["installation"]["information"].any()

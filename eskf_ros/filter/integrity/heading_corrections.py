@@ -19,7 +19,7 @@ HEADING = ATTITUDE + 2
 """Index of the error of the heading: the turn about the z axis of map."""
 
 CORRECTIONS = np.dtype(
-    [("since", "i8"), ("sum", "f8"), ("variance", "f8"), ("left", "f8"), ("right", "f8")],
+    [("since", "i8"), ("total", "f8"), ("variance", "f8"), ("left", "f8"), ("right", "f8")],
     align=True,
 )
 """Corrections of the heading since ``since`` (ns): their sum (rad) and the variance of that (rad2); and the CUSUM of
@@ -49,12 +49,12 @@ def weigh_correction(state, before, correction):
     c = state.corrections
     if c.since == NEVER or state.stamp - c.since > WINDOW:
         if c.since != NEVER and c.variance > 0.0:
-            sigmas = c.sum / math.sqrt(c.variance)
+            sigmas = c.total / math.sqrt(c.variance)
             c.left = max(0.0, c.left + sigmas - ALLOWANCE)
             c.right = max(0.0, c.right - sigmas - ALLOWANCE)
         c.since = state.stamp
-        c.sum = 0.0
+        c.total = 0.0
         c.variance = 0.0
-    c.sum += correction
+    c.total += correction
     c.variance += max(before - state.covariance[HEADING, HEADING], 0.0)
     return max(c.left, c.right) > LIMIT
