@@ -15,9 +15,9 @@ from scipy.stats import chi2
 from eskf_ros.filter.fuse import fuse
 from eskf_ros.filter.history.records import AID
 from eskf_ros.filter.inertial.strapdown import gravity_map
+from eskf_ros.filter.layout import blank_state
 from eskf_ros.filter.measurements.kalman_update import invert_positive, update, update_nominal_state
 from eskf_ros.filter.state.enums import Stream, Verdict
-from eskf_ros.filter.layout import blank_state
 from eskf_ros.filter.state.memory import allocate
 from support.kernels import (
     USUAL_STDS,

@@ -158,6 +158,8 @@ def hear(states, aid, gate, settings, work):
     if aid.stream == Stream.GNSS_POSITION and reset_jumped_error(states, settings, work):
         linearize(humble, aid, settings, work)
     nis, determinant = judge(humble, size, work)
+    if determinant == 0.0:
+        return True, False, nis, 0.0
     believed = False
     if state.trust.refused[kind, source] > 0 or is_jump(nis, kind, work):
         if is_expected(state, aid, gate, settings, work):
