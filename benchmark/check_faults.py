@@ -32,8 +32,8 @@ from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.frames import STRINGS
 from eskf_ros.simulate.messages import topics_of
 from eskf_ros.simulate.scenario import Recording, simulate
-from faults import BEGIN, FAULTS, RATE, STOP, Fault, Samples, parameters_of
 from markdown_table import table
+from sample_faults import BEGIN, FAULTS, RATE, STOP, Fault, Samples, parameters_of
 
 Messages = NDArray[Any]
 Change = Callable[[Messages, NDArray[np.int64], np.random.Generator], tuple[Messages, NDArray[np.int64]]]

@@ -21,7 +21,7 @@ from eskf_ros.parameters.ros_yaml import load
 from eskf_ros.simulate.frames import STRINGS
 from eskf_ros.simulate.messages import topics_of
 from eskf_ros.simulate.scenario import Recording, simulate
-from faults import Fault
+from sample_faults import Fault
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 BAG = CHECKOUT / "bags" / "tunnel_drive.mcap"

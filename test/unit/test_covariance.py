@@ -328,4 +328,3 @@ def test_accelerations_are_believed_for_a_while_after_one_that_stands_out() -> N
             assert force[2] == pytest.approx(9.81)
             believed += force[0] != 0.0
         assert believed * 0.01 == pytest.approx(seconds, abs=0.1)
-
