@@ -202,8 +202,10 @@ def largest_square(state, place):
     """Return the largest square of the lasting errors (in standard deviations), 0 while they are not active."""
     if place >= state.error_size:
         return 0.0
-    x, y, z = state.optional[place - ERROR_SIZE : place - ERROR_SIZE + 3]
-    return max(x * x, y * y, z * z)
+    largest = 0.0
+    for i in range(3):
+        largest = max(largest, abs(state.optional[place - ERROR_SIZE + i]))
+    return largest * largest
 
 
 @njit
