@@ -35,7 +35,7 @@ ACCELERATION_TIME = 1.0
 CREDIBLE = 5.0
 """Standard deviations (per axis) that the mean acceleration must exceed to be believed; noise alone never does."""
 
-EXCITED_TIME = 20.0
+EXCITED_TIME = 60.0
 """s; after an acceleration that was believed, those that follow are part of the same motion."""
 
 EXCITATION = np.dtype([("acceleration", "f8", (3,)), ("left", "f8")], align=True)

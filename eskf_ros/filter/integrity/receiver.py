@@ -76,7 +76,7 @@ def fuse_receiver(states, aid, gate, settings, work):
         if humble.heading_known == 0:
             heard = False
         elif jumps and aid.stream == Stream.GNSS_POSITION:
-            learn_from_change(state, aid.source, settings, work)
+            learn_from_change(state, humble, aid.source, settings, work)
             update_shares(state, humble, aid.source, settings, work)
         elif not jumps:
             learn(state, humble, aid, humble_nis, settings, work)

@@ -130,11 +130,11 @@ def learn_from_fix(state, lane, source, settings, work):
     if is_next and state.doubt == 0.0 and is_live(state, Stream.GNSS_VELOCITY.value, source):
         away = distance_from_path(lane, source, settings, work)
         state.scatter.spread[source] = running_mean(state.scatter.spread[source], used * away, SPREAD_GAIN)
-    learn_from_change(state, source, settings, work)
+    learn_from_change(state, lane, source, settings, work)
 
 
 @njit
-def learn_from_change(state, source, settings, work):
+def learn_from_change(state, lane, source, settings, work):
     """Learn how fixes change from one to the next; those that are refused count, too.
 
     ``work`` holds the innovation, and the inverse of the innovation covariance, which that of the fix before has, too:
@@ -151,10 +151,22 @@ def learn_from_change(state, source, settings, work):
     if state.stamp - scatter.last_stamp[source] <= LONGEST_PAIR:
         scatter.pairs[source] += 1.0
         gain = max(1.0 / scatter.pairs[source], CHANGE_GAIN)
-        scatter.change[source] = running_mean(scatter.change[source], used * change / 3.0, gain)
+        found = used * change / 3.0
+        if is_wide(lane, work):
+            found = max(found, 1.0)
+        scatter.change[source] = running_mean(scatter.change[source], found, gain)
     scatter.last_stamp[source] = state.stamp
     for a in range(3):
         scatter.last_innovation[source, a] = work.innovation[a]
+
+
+@njit
+def is_wide(lane, work):
+    """Say whether the position of a lane is less certain than the fix in ``work``: then small changes say nothing."""
+    for i in range(3):
+        if lane.covariance[POSITION + i, POSITION + i] > work.noise[i, i]:
+            return True
+    return False
 
 
 @njit
