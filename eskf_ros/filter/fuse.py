@@ -15,7 +15,6 @@ from eskf_ros.filter.integrity.installation_monitor import find_faults, learn_fa
 from eskf_ros.filter.integrity.receiver import fuse_receiver, reset_for_new_solution
 from eskf_ros.filter.integrity.receiver_monitor import watch_receiver
 from eskf_ros.filter.integrity.recovery import note, recover
-from eskf_ros.filter.integrity.refusal import kind_of
 from eskf_ros.filter.integrity.repeated_fixes import is_repeated, note_copy, note_fused_fix
 from eskf_ros.filter.measurements import (
     baro,
@@ -91,7 +90,8 @@ def offer(states, aid, heading_before, settings, work):
         return
     update_error_size(state, settings.reach[aid.stream], settings)
     gate = settings.gate[aid.stream, 3]
-    if kind_of(aid.stream) >= 0:
+    is_gnss = aid.stream in (Stream.GNSS_POSITION, Stream.GNSS_VELOCITY)
+    if is_gnss:
         reset_for_new_solution(state, aid, settings)
         fuse_receiver(states, aid, gate, settings, work)
         size = aid.dof
@@ -105,7 +105,7 @@ def offer(states, aid, heading_before, settings, work):
     if aid.verdict != Verdict.BAD_COVARIANCE:
         learn_faults(state, aid, size, gate, work, settings)
         find_faults(state, work)
-        if kind_of(aid.stream) >= 0:
+        if is_gnss:
             watch_receiver(state, aid, work, settings)
     if aid.verdict == Verdict.FUSED and state.heading_known == 0:
         search_heading(state, aid, gate, settings, work)

@@ -236,13 +236,17 @@ def _consistency(values: NDArray[np.float64]) -> dict[str, float] | None:
     return {"mean": float(values.mean()), "in_95": float(np.mean(values <= CHI_SQUARE_95[3]))}
 
 
+FUSING = (Verdict.FUSED, Verdict.WEIGHED_DOWN, Verdict.TAKEOVER, Verdict.RESET)
+"""Verdicts of measurements from which the estimate has learned."""
+
+
 def counted(verdicts: NDArray[np.int64]) -> dict[str, int]:
     """Return the numbers of offered, fused, rejected and late measurements from counts by `Verdict`.
 
-    `rejected` is every verdict but fused, waiting, and outside_history, which is `late`.
+    `fused` are those of the verdicts `FUSING`; `rejected` all others but waiting, and outside_history, which is `late`.
     """
     offered, waiting = int(verdicts.sum()), int(verdicts[Verdict.WAITING])
-    fused = int(verdicts[Verdict.FUSED] + verdicts[Verdict.WEIGHED_DOWN] + verdicts[Verdict.RESET])
+    fused = int(sum(verdicts[verdict] for verdict in FUSING))
     late = int(verdicts[Verdict.OUTSIDE_HISTORY])
     return {"offered": offered, "fused": fused, "rejected": offered - fused - late - waiting, "late": late}
 

@@ -92,7 +92,8 @@ def third_party_imports_of_tests() -> set[str]:
     files = set(tests.values())
     while borrowed := {benchmarks[name] for name in imports_of(files) & (benchmarks.keys() - tests.keys())} - files:
         files |= borrowed
-    own = {"eskf_ros", "support", *benchmarks, *tests}
+    folders = {path.parent.name for path in (CHECKOUT / "benchmark").glob("*/__init__.py")}
+    own = {"eskf_ros", "support", *folders, *benchmarks, *tests}
     return imports_of(files) - set(sys.stdlib_module_names) - OPTIONAL - own
 
 

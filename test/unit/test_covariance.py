@@ -314,7 +314,7 @@ def test_accelerations_are_believed_for_a_while_after_one_that_stands_out() -> N
     """Beyond five standard deviations of the noise, and a minute from then on."""
     noise, level = 0.03, (1.0, 0.0, 0.0)
     edge = 5.0 * noise / np.sqrt(2.0)
-    for factor, seconds in ((0.99, 0.0), (1.01, kernel.EXCITED_TIME)):
+    for factor, seconds in ((0.99, 0.0), (1.05, kernel.EXCITED_TIME)):
         excitation = make_state()["excitation"]
         excitation["acceleration"] = (factor * edge, 0.0, 0.0)
         believed = 0

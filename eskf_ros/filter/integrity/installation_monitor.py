@@ -110,6 +110,9 @@ def learn_faults(state, aid, size, gate, work, settings):
     if state.heading_known == 0 or aid.verdict in (Verdict.RESET, Verdict.TAKEOVER):
         # What was learnt from an estimate that was wrong goes with it.
         state.installation.stamp = NEVER
+        if aid.verdict == Verdict.TAKEOVER:
+            # A wrong lever arm or time offset may be why the filter seemed wrong.
+            return
         state.installation.information.fill(0.0)
         state.installation.evidence.fill(0.0)
         state.installation.found.fill(0.0)

@@ -109,7 +109,7 @@ def watch_fix(state, aid):
         state.receiver.coasts += 1
         state.receiver.coast_nis += min(aid.nis / 3.0, NIS_CLIP**2)
     state.receiver.seen_stamp[source] = state.stamp
-    factor = state.scatter.spread[source]
+    factor = max(state.scatter.spread[source], state.scatter.change[source])
     if factor > NOTABLE_SCATTER:
         state.receiver.scattered_fixes[source] += 1
         state.receiver.scatter_sum[source] += factor

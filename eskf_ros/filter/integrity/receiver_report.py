@@ -78,8 +78,14 @@ def _fault_complaints(state: np.void, settings: np.void, source: int) -> list[st
 
 def _covariance_complaints(state: np.void, source: int, scale: float) -> list[str]:
     count, scattered = int(state["receiver"]["fix_count"][source]), int(state["receiver"]["scattered_fixes"][source])
-    if scattered > max(MANY_FIXES, count // 20):
+    if scattered > max(MANY_FIXES, count // 10):
         factor = float(state["receiver"]["scatter_sum"][source]) / scattered
+        if float(state["scatter"]["change"][source]) < 0.5 * factor:
+            return [
+                f"{scattered} of {count} fixes{_of(source)} moved otherwise than the velocities of the same receiver, "
+                f"by {math.sqrt(factor):.1f} times what they claim: multipath or spoofing; this is taken for a lasting "
+                "error of the fixes"
+            ]
         return [
             f"the fixes{_of(source)} scatter {math.sqrt(factor):.1f} times as much as they claim ({scattered} of "
             f"{count}): set gnss.covariance_scale to {factor * scale:.2g}, or gnss.position_std_floor"

@@ -48,8 +48,8 @@ SPREAD_GAIN = 0.08
 SPREAD_CLIP = 4.0
 """One message counts with at most this many times the present spread."""
 
-LARGEST_SPREAD = 1000.0
-"""Largest spread: messages that scatter thirty times as much as they claim are used for what they are."""
+LARGEST_SPREAD = 1e6
+"""Largest spread: receivers that claim millimetres for metres are used for what they are."""
 
 CHANGE_GAIN = 0.02
 """Least weight of the newest pair of fixes in the running mean of their changes."""
@@ -150,7 +150,8 @@ def learn_from_change(state, lane, source, settings, work):
             change += 0.5 * change_a * work.innovation_covariance[a, b] * change_b
     if state.stamp - scatter.last_stamp[source] <= LONGEST_PAIR:
         scatter.pairs[source] += 1.0
-        gain = max(1.0 / scatter.pairs[source], CHANGE_GAIN)
+        least = SPREAD_GAIN if scatter.change[source] > NOTABLE_SCATTER else CHANGE_GAIN
+        gain = max(1.0 / scatter.pairs[source], least)
         found = used * change / 3.0
         if is_wide(lane, work):
             found = max(found, 1.0)
