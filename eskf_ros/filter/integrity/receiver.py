@@ -34,7 +34,6 @@ from eskf_ros.filter.integrity.scatter import (
     update_shares,
 )
 from eskf_ros.filter.measurements.kalman_update import apply, judge, project, update
-from eskf_ros.filter.state.augmented_states import reset_augmented
 from eskf_ros.filter.state.enums import Stream, Verdict
 from eskf_ros.filter.state.lanes import FILTER, HUMBLE, is_running
 from eskf_ros.filter.state.streams import is_live
@@ -44,7 +43,7 @@ SAME_SOLUTION = 4.0
 
 
 @njit
-def reset_for_new_solution(state, aid, settings):
+def reset_for_new_solution(states, aid, settings):
     """Reset the learnt scatter and the correlated error of fixes when the receiver changes its kind of solution.
 
     A sudden change of the accuracy that it claims means another kind (single, float, fixed): what was learnt of the
@@ -52,12 +51,10 @@ def reset_for_new_solution(state, aid, settings):
     """
     if aid.stream != Stream.GNSS_POSITION:
         return
-    variance = aid.payload[XX] + aid.payload[YY]
+    state, variance = states[FILTER], aid.payload[XX] + aid.payload[YY]
     last = state.window.last_fix_variance[aid.source]
     if max(variance, last) > SAME_SOLUTION * min(variance, last):
-        forget_scatter(state, aid.source)
-        if settings.position_error_at < state.error_size and settings.correlated_share > 0.0:
-            reset_augmented(state, settings.position_error_at, 3, settings)
+        forget_scatter(state, states[HUMBLE], aid.source, settings)
     state.window.last_fix_variance[aid.source] = variance
 
 
@@ -76,7 +73,7 @@ def fuse_receiver(states, aid, gate, settings, work):
         if humble.heading_known == 0:
             heard = False
         elif jumps and aid.stream == Stream.GNSS_POSITION:
-            learn_from_change(state, humble, aid.source, settings, work)
+            learn_from_change(state, humble, aid.source, False, settings, work)
             update_shares(state, humble, aid.source, settings, work)
         elif not jumps:
             learn(state, humble, aid, humble_nis, settings, work)

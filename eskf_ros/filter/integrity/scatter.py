@@ -17,7 +17,7 @@ from eskf_ros.filter.measurements.gnss_position import LEAST_WHITE, noise_shares
 from eskf_ros.filter.measurements.gnss_velocity import noise_factor
 from eskf_ros.filter.state.augmented_states import reset_augmented, update_error_size
 from eskf_ros.filter.state.enums import Stream
-from eskf_ros.filter.state.error_state import ERROR_SIZE, NOWHERE, POSITION, SOURCES
+from eskf_ros.filter.state.error_state import ERROR_SIZE, NOWHERE, POSITION, SOURCES, VELOCITY
 from eskf_ros.filter.state.streams import is_live
 
 SCATTER = np.dtype(
@@ -25,21 +25,23 @@ SCATTER = np.dtype(
         ("spread", "f8", (SOURCES,)),
         ("change", "f8", (SOURCES,)),
         ("pairs", "f8", (SOURCES,)),
+        ("recent", "f8", (SOURCES, 2)),
         ("velocity", "f8", (SOURCES,)),
         ("white", "f8", (SOURCES,)),
         ("lasting", "f8", (SOURCES,)),
         ("last_stamp", "i8", (SOURCES,)),
-        ("last_innovation", "f8", (SOURCES, 3)),
+        ("last_residual", "f8", (SOURCES, 3)),
     ],
     align=True,
 )
 """Scatter of the messages of the receivers, by source: mean squares over what the covariances allow.
 
 - ``spread``, ``velocity``: of the innovations of positions and velocities in the humble lane.
-- ``change``, ``pairs``: of the differences of two consecutive innovations of positions, in which errors that last
-  cancel, and the number of pairs.
+- ``change``, ``pairs``: of the differences of the errors of two consecutive fixes, in which those that last cancel, and the number of pairs.
+- ``recent``: the last two of these differences, the older one first.
 - ``white``, ``lasting``: shares of the claimed variance that are new with each fix, and that last, as they are used.
-- ``last_stamp``, ``last_innovation``: of the last fix (ns; m, map).
+- ``last_stamp``, ``last_residual``: of the last fix: its stamp (ns), and how far it was from the position of the humble
+  lane once this was corrected (m, map).
 """
 
 SPREAD_GAIN = 0.08
@@ -56,6 +58,9 @@ CHANGE_GAIN = 0.02
 
 FEWEST_PAIRS = 25.0
 """Pairs of fixes before which their changes say nothing."""
+
+FEWEST_WILD_PAIRS = 3.0
+"""Pairs of fixes before which even changes far beyond the claims say nothing."""
 
 LONGEST_PAIR = 2_500_000_000
 """ns; two fixes further apart than this do not show the scatter: the humble lane drifts between them."""
@@ -85,12 +90,18 @@ def copy_scatter(state, lane, source):
 
 
 @njit
-def forget_scatter(state, source):
-    """Forget what was learnt of the fixes of a receiver: it has changed its kind of solution."""
+def forget_scatter(state, lane, source, settings):
+    """Forget what was learnt of the fixes of a receiver, and their lasting error: it has changed its kind of solution."""
+    state.scatter.lasting[source] = 0.0
+    if settings.position_error_at < state.error_size:
+        reset_augmented(state, settings.position_error_at, 3, settings)
+    if settings.position_error_at < lane.error_size:
+        reset_augmented(lane, settings.position_error_at, 3, settings)
     state.scatter.spread[source] = 1.0
     state.scatter.change[source] = 1.0
     state.scatter.white[source] = 1.0
     state.scatter.pairs[source] = 0.0
+    state.scatter.recent[source] = 0.0
 
 
 @njit
@@ -107,9 +118,9 @@ def forget_spread(state, lane, settings):
 
 
 @njit
-def running_mean(mean, found, gain):
-    """Return the running mean after a newest value, which is clipped."""
-    found = min(found, SPREAD_CLIP * max(mean, 1.0))
+def running_mean(mean, found, gain, least=1.0):
+    """Return the running mean after a newest value, clipped at a multiple of the larger of the mean and ``least``."""
+    found = min(found, SPREAD_CLIP * max(mean, least))
     return min(mean + gain * (found - mean), LARGEST_SPREAD)
 
 
@@ -130,44 +141,47 @@ def learn_from_fix(state, lane, source, settings, work):
     if is_next and state.doubt == 0.0 and is_live(state, Stream.GNSS_VELOCITY.value, source):
         away = distance_from_path(lane, source, settings, work)
         state.scatter.spread[source] = running_mean(state.scatter.spread[source], used * away, SPREAD_GAIN)
-    learn_from_change(state, lane, source, settings, work)
+    learn_from_change(state, lane, source, True, settings, work)
 
 
 @njit
-def learn_from_change(state, lane, source, settings, work):
-    """Learn how fixes change from one to the next; those that are refused count, too.
+def learn_from_change(state, lane, source, is_fused, settings, work):
+    """Learn how the errors of fixes change from one to the next; fixes that are refused count, too.
 
-    ``work`` holds the innovation, and the inverse of the innovation covariance, which that of the fix before has, too:
-    the innovations of a humble lane are nearly independent.
+    ``work`` holds a fix in the humble ``lane`` which, if ``is_fused``, has just been corrected by it. The difference of
+    its innovation and of what the fix before has left after its correction is that of the errors of the two fixes, but
+    for the error of the velocity in between; a lasting error cancels.
     """
-    scatter = state.scatter
+    scatter, place = state.scatter, settings.position_error_at
     used, _ = noise_shares(state, source, settings)
-    change = 0.0
-    for a in range(3):
-        for b in range(3):
-            change_a = work.innovation[a] - scatter.last_innovation[source, a]
-            change_b = work.innovation[b] - scatter.last_innovation[source, b]
-            change += 0.5 * change_a * work.innovation_covariance[a, b] * change_b
-    if state.stamp - scatter.last_stamp[source] <= LONGEST_PAIR:
-        scatter.pairs[source] += 1.0
-        least = SPREAD_GAIN if scatter.change[source] > NOTABLE_SCATTER else CHANGE_GAIN
-        gain = max(1.0 / scatter.pairs[source], least)
-        found = used * change / 3.0
-        if is_wide(lane, work):
-            found = max(found, 1.0)
-        scatter.change[source] = running_mean(scatter.change[source], found, gain)
-    scatter.last_stamp[source] = state.stamp
-    for a in range(3):
-        scatter.last_innovation[source, a] = work.innovation[a]
-
-
-@njit
-def is_wide(lane, work):
-    """Say whether the position of a lane is less certain than the fix in ``work``: then small changes say nothing."""
+    dt = (state.stamp - scatter.last_stamp[source]) * 1e-9
+    change, is_wide = 0.0, False
     for i in range(3):
-        if lane.covariance[POSITION + i, POSITION + i] > work.noise[i, i]:
-            return True
-    return False
+        noise, drift = work.noise[i, i], lane.covariance[VELOCITY + i, VELOCITY + i] * dt * dt
+        before = work.innovation[i]
+        if place < lane.error_size:
+            correction = work.correction[place + i] if is_fused else 0.0
+            before += work.jacobian[i, place + i] * (lane.optional[place - ERROR_SIZE + i] - correction)
+        difference = before - scatter.last_residual[source, i]
+        change += difference * difference / (2.0 * noise + drift) / 3.0
+        is_wide |= drift > noise / used
+        scatter.last_residual[source, i] = before
+        for j in range(ERROR_SIZE):
+            if is_fused:
+                scatter.last_residual[source, i] -= work.jacobian[i, j] * work.correction[j]
+    is_next = state.stamp - scatter.last_stamp[source] <= LONGEST_PAIR
+    scatter.last_stamp[source] = state.stamp
+    if not is_next:
+        return
+    scatter.pairs[source] += 1.0
+    least = SPREAD_GAIN if scatter.change[source] > NOTABLE_SCATTER else CHANGE_GAIN
+    gain = max(1.0 / scatter.pairs[source], least)
+    found = max(used * change, 1.0) if is_wide else used * change
+    # A fix that is far off changes two pairs, a step one. Three in a row are the scatter.
+    usual = max(1.0, min(found, scatter.recent[source, 0], scatter.recent[source, 1]))
+    scatter.change[source] = running_mean(scatter.change[source], found, gain, usual)
+    scatter.recent[source, 0] = scatter.recent[source, 1]
+    scatter.recent[source, 1] = found
 
 
 @njit
@@ -189,7 +203,7 @@ def update_shares(state, lane, source, settings, work):
     ``work.noise`` is that of the fix in the humble lane: the new share of what it claims.
     """
     scatter = state.scatter
-    if scatter.pairs[source] < FEWEST_PAIRS or settings.position_error_at == NOWHERE or settings.correlated_share > 0.0:
+    if not is_enough(scatter.pairs[source], scatter.change[source]) or settings.position_error_at == NOWHERE or settings.correlated_share > 0.0:
         return
     used = scatter.white[source]
     change, spread = scatter.change[source], scatter.spread[source]
@@ -205,9 +219,17 @@ def update_shares(state, lane, source, settings, work):
     if found > STEADY * lasting or found * STEADY < lasting:
         scatter.lasting[source] = found
         if found > 0.0:
-            factor = found / max(used, LEAST_WHITE) if change < NOTABLE_CALM or off > 0.0 else 0.0
+            calm = 1.0 - change if change < NOTABLE_CALM else 0.0
+            is_followed = found <= STEADY * calm or off > 0.0
+            factor = found / max(used, LEAST_WHITE) if is_followed else 0.0
             inflate_lasting_error(state, lasting, found, factor, settings, work)
             inflate_lasting_error(lane, lasting, found, factor, settings, work)
+
+
+@njit
+def is_enough(pairs, change):
+    """Say whether pairs of fixes show their scatter: a few are enough if it is far beyond the claims."""
+    return pairs >= FEWEST_PAIRS or (pairs >= FEWEST_WILD_PAIRS and change * pairs > NOTABLE_SCATTER * FEWEST_PAIRS)
 
 
 @njit
