@@ -100,6 +100,9 @@ def fuse_receiver(states, aid, gate, settings, work):
         believed = True
     else:
         aid.verdict = Verdict.GATE
+    if state.heading_known == 0 and aid.stream == Stream.GNSS_POSITION and not believed:
+        learn_from_change(state, state, aid.source, aid.verdict != Verdict.GATE, settings, work)
+        update_shares(state, state, aid.source, settings, work)
     if heard and not jumps and not believed:
         drifts = weigh_correction(state, heading_variance, work.correction[HEADING])
         worse = weigh_evidence(states, aid, aid.nis, math.log(determinant), humble_nis, humble_log, settings)

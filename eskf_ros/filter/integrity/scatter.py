@@ -200,7 +200,8 @@ def distance_from_path(lane, source, settings, work):
 def update_shares(state, lane, source, settings, work):
     """Draw the conclusions for the noise of the fixes: how much of it is new with each of them, how much lasts.
 
-    ``work.noise`` is that of the fix in the humble lane: the new share of what it claims.
+    ``work.noise`` is that of the fix in the humble ``lane``: the new share of what it claims. While the heading is
+    unknown there is no such lane, and ``lane`` is the filter.
     """
     scatter = state.scatter
     if not is_enough(scatter.pairs[source], scatter.change[source]) or settings.position_error_at == NOWHERE or settings.correlated_share > 0.0:
@@ -223,7 +224,8 @@ def update_shares(state, lane, source, settings, work):
             is_followed = found <= STEADY * calm or off > 0.0
             factor = found / max(used, LEAST_WHITE) if is_followed else 0.0
             inflate_lasting_error(state, lasting, found, factor, settings, work)
-            inflate_lasting_error(lane, lasting, found, factor, settings, work)
+            if state.heading_known == 1:
+                inflate_lasting_error(lane, lasting, found, factor, settings, work)
 
 
 @njit
