@@ -168,7 +168,7 @@ def run(recording: Recording, navigator: Navigator, interval: float = 0.5) -> Ru
         records.append(navigator.take_records())
         aligned.append(bool(state["heading_known"]))
         errors.append(state_error(recording, i, truth[k], state))
-        covariances.append(state["covariance"][:ERROR_SIZE, :ERROR_SIZE])
+        covariances.append(published_covariance(state)[:ERROR_SIZE, :ERROR_SIZE])
     records.append(navigator.finish())
     return Run(
         seconds=(stops + 1) / recording.options.imu_rate,
@@ -177,6 +177,15 @@ def run(recording: Recording, navigator: Navigator, interval: float = 0.5) -> Ru
         covariance=np.array(covariances),
         records=np.concatenate(records, dtype=RECORD),
     )
+
+
+def published_covariance(states: np.void | NDArray[Any]) -> Array:
+    """Return the covariances of one state or of many (...,), with the lasting errors of fixes that odometry adds."""
+    covariance = np.array(states["covariance"])
+    scatter = states["scatter"]
+    held = (scatter["share"] ** 2 * (scatter["calm"][..., None] * scatter["claimed"])).sum(axis=-2)
+    covariance[..., np.arange(3), np.arange(3)] += held
+    return covariance
 
 
 def nees(error: Array, covariance: Array, block: slice) -> Array:

@@ -21,7 +21,7 @@ from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.imu import ImuMount
 from eskf_ros.simulate.scenario import Recording, simulate
 from eskf_ros.tables.feeding import rows_from
-from monte_carlo import NO_SIDE_SLIP, Message, feed, messages_of
+from monte_carlo import NO_SIDE_SLIP, Message, feed, messages_of, published_covariance
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -197,7 +197,7 @@ def _trace(
     position = position + body_to_map.apply(mount.position)
     imu_to_map = body_to_map * Rotation.from_matrix(mount.rotation_imu_to_body)
     turn = (imu_to_map * Rotation.from_quat(states["attitude"][:, [1, 2, 3, 0]]).inv()).as_rotvec()
-    covariance = states["covariance"]
+    covariance = published_covariance(states)
     away = position - states["position_map"]
     is_known = states["heading_known"].astype(bool)
     sigma = np.sqrt(np.maximum(covariance[:, 8, 8], 1e-12))

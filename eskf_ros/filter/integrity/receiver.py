@@ -26,6 +26,7 @@ from eskf_ros.filter.integrity.recovery import note, note_reset
 from eskf_ros.filter.integrity.refusal import JUMP_GATE, kind_of, note_jump
 from eskf_ros.filter.integrity.scatter import (
     copy_scatter,
+    follow_calm_error,
     forget_scatter,
     forget_spread,
     learn_from_change,
@@ -100,8 +101,11 @@ def fuse_receiver(states, aid, gate, settings, work):
         believed = True
     else:
         aid.verdict = Verdict.GATE
+    is_fused = believed or aid.verdict in (Verdict.FUSED, Verdict.WEIGHED_DOWN)
+    if is_fused and aid.stream == Stream.GNSS_POSITION:
+        follow_calm_error(state, aid.source, settings, work)
     if state.heading_known == 0 and aid.stream == Stream.GNSS_POSITION and not believed:
-        learn_from_change(state, state, aid.source, aid.verdict != Verdict.GATE, settings, work)
+        learn_from_change(state, state, aid.source, is_fused, settings, work)
         update_shares(state, state, aid.source, settings, work)
     if heard and not jumps and not believed:
         drifts = weigh_correction(state, heading_variance, work.correction[HEADING])

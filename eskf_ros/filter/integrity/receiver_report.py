@@ -14,7 +14,6 @@ from eskf_ros.filter.integrity.receiver_monitor import (
     MANY_FIXES,
     UNLIKELY,
 )
-from eskf_ros.filter.integrity.scatter import NOTABLE_CALM
 from eskf_ros.filter.state.error_state import SOURCES
 
 
@@ -98,7 +97,7 @@ def aid_notes(state: np.void) -> list[str]:
     found = []
     for source in range(SOURCES):
         change, pairs = float(state["scatter"]["change"][source]), float(state["scatter"]["pairs"][source])
-        if pairs > 2 * MANY_FIXES and change < NOTABLE_CALM and state["scatter"]["lasting"][source] > 0.0:
+        if pairs > 2 * MANY_FIXES and state["scatter"]["calm"][source] > 0.0:
             found.append(
                 f"the fixes{_of(source)} change by {math.sqrt(change):.2f} times what they claim from one to the next: "
                 "their errors last. This is allowed for (gnss.correlation_time, gnss.correlated_share)"

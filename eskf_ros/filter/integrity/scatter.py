@@ -1,8 +1,11 @@
 """How much the messages of a receiver scatter, learned from their innovations in the humble lane.
 
 Covariances of receivers are claims. Fixes that differ by more from one to the next than they claim are fused with more
-noise. Fixes that differ by less, or that stay away from the path together, have an error that lasts: it becomes an
-augmented state (`gnss_position.split_noise`), and the position, which has followed it, is widened by it once.
+noise. Fixes that stay away from the path together have an error that lasts and that the path shows: it becomes an
+augmented state (`gnss_position.split_noise`). Fixes that differ by less from one to the next than they claim have an
+error that lasts, too, which nothing shows: the position follows it. It is held as a consider state (Schmidt, 1966;
+Jazwinski, Stochastic Processes and Filtering Theory, section 8.4): the estimate is what it would be without, and the
+covariance of the position that is published has it in addition.
 """
 
 from __future__ import annotations
@@ -29,6 +32,9 @@ SCATTER = np.dtype(
         ("velocity", "f8", (SOURCES,)),
         ("white", "f8", (SOURCES,)),
         ("lasting", "f8", (SOURCES,)),
+        ("calm", "f8", (SOURCES,)),
+        ("share", "f8", (SOURCES, 3)),
+        ("claimed", "f8", (SOURCES, 3)),
         ("last_stamp", "i8", (SOURCES,)),
         ("last_residual", "f8", (SOURCES, 3)),
     ],
@@ -39,7 +45,10 @@ SCATTER = np.dtype(
 - ``spread``, ``velocity``: of the innovations of positions and velocities in the humble lane.
 - ``change``, ``pairs``: of the differences of the errors of two consecutive fixes, in which those that last cancel, and the number of pairs.
 - ``recent``: the last two of these differences, the older one first.
-- ``white``, ``lasting``: shares of the claimed variance that are new with each fix, and that last, as they are used.
+- ``white``, ``lasting``: shares of the claimed variance that are new with each fix, and that last and are estimated.
+- ``calm``: share of the claimed variance that lasts and is followed by the position.
+- ``share``, ``claimed``: share of the position that comes from the fixes, and the variance they claim (m2; per axis of
+  map).
 - ``last_stamp``, ``last_residual``: of the last fix: its stamp (ns), and how far it was from the position of the humble
   lane once this was corrected (m, map).
 """
@@ -77,10 +86,6 @@ STEADY = 2.0
 LARGEST_VALUE = 2.0
 """Standard deviations of a lasting error; one that is found to be larger keeps its scale."""
 
-LEAST_LASTING = 0.3
-"""Least lasting share that is worth the augmented states."""
-
-
 @njit
 def copy_scatter(state, lane, source):
     """Let a lane use what was learnt of a receiver."""
@@ -91,8 +96,16 @@ def copy_scatter(state, lane, source):
 
 @njit
 def forget_scatter(state, lane, source, settings):
-    """Forget what was learnt of the fixes of a receiver, and their lasting error: it has changed its kind of solution."""
+    """Forget what was learnt of the fixes of a receiver, and their lasting error: it has changed its kind of solution.
+
+    The new fixes show the lasting error of the old ones: what of it is in the position is an error like any other now.
+    """
+    for i in range(3):
+        if state.scatter.calm[source] > 0.0:
+            state.covariance[POSITION + i, POSITION + i] += held_variance(state, i)
+        state.scatter.share[source, i] = 0.0
     state.scatter.lasting[source] = 0.0
+    state.scatter.calm[source] = 0.0
     if settings.position_error_at < state.error_size:
         reset_augmented(state, settings.position_error_at, 3, settings)
     if settings.position_error_at < lane.error_size:
@@ -109,9 +122,8 @@ def forget_spread(state, lane, settings):
     """Forget how far fixes were from a path that was wrong, and the lasting errors that were concluded from it."""
     for source in range(SOURCES):
         state.scatter.spread[source] = 1.0
-        calm = 1.0 - state.scatter.change[source] if state.scatter.change[source] < NOTABLE_CALM else 0.0
-        if state.scatter.lasting[source] > STEADY * calm:
-            state.scatter.lasting[source] = calm
+        if state.scatter.lasting[source] > 0.0:
+            state.scatter.lasting[source] = 0.0
             if settings.position_error_at < state.error_size:
                 reset_augmented(state, settings.position_error_at, 3, settings)
                 reset_augmented(lane, settings.position_error_at, 3, settings)
@@ -208,10 +220,8 @@ def update_shares(state, lane, source, settings, work):
         return
     used = scatter.white[source]
     change, spread = scatter.change[source], scatter.spread[source]
-    scatter.white[source] = change if change > NOTABLE_SCATTER or change < NOTABLE_CALM else 1.0
+    scatter.white[source] = change if change > NOTABLE_SCATTER else 1.0
     found = max(spread if spread > NOTABLE_SCATTER else 1.0, scatter.white[source]) - scatter.white[source]
-    if found < LEAST_LASTING:
-        found = 0.0
     off = unmodelled_position(state, source)
     claimed = (work.noise[0, 0] + work.noise[1, 1]) / (2.0 * max(used, LEAST_WHITE))
     found = max(found, min(off * off / claimed, LARGEST_SPREAD))
@@ -220,12 +230,38 @@ def update_shares(state, lane, source, settings, work):
     if found > STEADY * lasting or found * STEADY < lasting:
         scatter.lasting[source] = found
         if found > 0.0:
-            calm = 1.0 - change if change < NOTABLE_CALM else 0.0
-            is_followed = found <= STEADY * calm or off > 0.0
-            factor = found / max(used, LEAST_WHITE) if is_followed else 0.0
+            factor = found / max(used, LEAST_WHITE) if off > 0.0 else 0.0
             inflate_lasting_error(state, lasting, found, factor, settings, work)
             if state.heading_known == 1:
                 inflate_lasting_error(lane, lasting, found, factor, settings, work)
+    is_calm = change < NOTABLE_CALM and scatter.lasting[source] == 0.0
+    scatter.calm[source] = 1.0 - change if is_calm else 0.0
+
+
+@njit
+def follow_calm_error(state, source, settings, work):
+    """Update how much of the position comes from the lasting errors of the fixes, after a fix has been fused.
+
+    ``work`` holds its gain and its noise. A constant error of the fixes comes into the position as the fixes do, and the
+    IMU knows nothing of it: a <- (1 - K) a + K.
+    """
+    scatter = state.scatter
+    white, _ = noise_shares(state, source, settings)
+    for i in range(3):
+        gain = work.gain[POSITION + i, i]
+        for other in range(SOURCES):
+            scatter.share[other, i] *= 1.0 - gain
+        scatter.share[source, i] += gain
+        scatter.claimed[source, i] = work.noise[i, i] / white
+
+
+@njit
+def held_variance(state, axis):
+    """Return the variance (m2) of the position on an axis of map that comes from lasting errors of fixes."""
+    scatter, total = state.scatter, 0.0
+    for source in range(SOURCES):
+        total += scatter.share[source, axis] ** 2 * scatter.calm[source] * scatter.claimed[source, axis]
+    return total
 
 
 @njit
@@ -249,9 +285,9 @@ def largest_square(state, place):
 def inflate_lasting_error(state, before, now, factor, settings, work):
     """Change the scale of the lasting error from the share ``before`` to ``now``; the value stays.
 
-    Where it grows because fixes change less than they claim, the position is widened, too, by ``factor`` times the
-    noise in ``work``: it has followed an error that was not known of, so that the two are the same with opposite signs.
-    An error that is seen because the position has not followed it leaves the position as it is.
+    Where it is known to be in the position, too, which has followed it (a wrong lever arm), the position is widened by
+    ``factor`` times the noise in ``work``: the two are the same with opposite signs. An error that is seen because the
+    position has not followed it leaves the position as it is.
     """
     place = settings.position_error_at
     update_error_size(state, place + 3, settings)

@@ -9,6 +9,7 @@ import numpy as np
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.levelling import UNKNOWN_SPEED
 from eskf_ros.filter.inertial.navigation_frame import body_rate, heading_of
+from eskf_ros.filter.integrity.scatter import held_variance
 from eskf_ros.filter.output.status import quality_of, status_of
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, GYRO_BIAS, POSITION, VELOCITY
 from eskf_ros.geodesy.rotation import cross, from_matrix, from_rotation_vector, multiply, rotate, rotate_back, to_matrix
@@ -102,7 +103,7 @@ def write_odometry(state, local, settings, row):
         row.accel_bias_std[i] = math.sqrt(max(covariance[ACCEL_BIAS + i, ACCEL_BIAS + i], 0.0))
         row.gyro_bias_std[i] = math.sqrt(max(covariance[GYRO_BIAS + i, GYRO_BIAS + i], 0.0))
     write_local_pose(state, local, attitude, settings, row)
-    write_pose_covariance(covariance, imu_offset, row)
+    write_pose_covariance(state, imu_offset, row)
     write_twist_covariance(state, base_to_map, settings, row)
 
 
@@ -131,8 +132,9 @@ def cross_row(v, i):
 
 
 @njit
-def write_pose_covariance(covariance, imu_offset, row):
+def write_pose_covariance(state, imu_offset, row):
     """Write the 6x6 covariance of position and attitude of base_link (map axes)."""
+    covariance = state.covariance
     for i in range(3):
         a = cross_row(imu_offset, i)
         for j in range(3):
@@ -150,6 +152,7 @@ def write_pose_covariance(covariance, imu_offset, row):
             row.pose_covariance[3 + j, i] = mixed
             row.pose_covariance[3 + i, 3 + j] = covariance[ATTITUDE + i, ATTITUDE + j]
     for i in range(3):
+        row.pose_covariance[i, i] += held_variance(state, i)
         for j in range(i):
             row.pose_covariance[i, j] = row.pose_covariance[j, i]
 

@@ -11,6 +11,7 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.integrity.heading_monitor import has_lasting_difference
+from eskf_ros.filter.integrity.scatter import held_variance
 from eskf_ros.filter.state.enums import Quality, Status
 from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, POSITION
 from eskf_ros.filter.state.time import NEVER
@@ -78,7 +79,9 @@ def quality_of(state, status, settings):
         return Quality.SETTLING
     if status == Status.COASTING and state.stamp - state.recovery.absolute_stamp > coast_time:
         return Quality.COASTED_TOO_LONG
-    variance = state.covariance[POSITION, POSITION] + state.covariance[POSITION + 1, POSITION + 1]
+    variance = 0.0
+    for i in range(2):
+        variance += state.covariance[POSITION + i, POSITION + i] + held_variance(state, i)
     if variance > settings.quality_position_std**2:
         return Quality.TOO_UNCERTAIN
     return Quality.COASTING if status == Status.COASTING else Quality.GOOD
