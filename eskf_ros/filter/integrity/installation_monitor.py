@@ -29,6 +29,12 @@ POSITION_TIME = 3
 VELOCITY_TIME = 4
 """Index of the time offset of velocities among the faults."""
 
+LASTING_TIME = 60.0
+"""s; correlation time of the errors of fixes that last, as far as the faults are concerned."""
+
+LEAST_INTERVAL = 0.05
+"""s; interval of fixes below which more of them do not say more."""
+
 MEMORY = 600.0
 """s; time constant with which the normal equations of the faults forget."""
 
@@ -211,14 +217,15 @@ def weigh_faults(state, source, dt, weight, work):
 def find_faults(state, work):
     """Solve the normal equations every `CHECK_INTERVAL`, and note which faults are certain.
 
-    Innovations and a scatter that are larger than expected widen the standard deviations. A large fault leaks into the
-    estimates of the others.
+    Innovations and a scatter that are larger than expected widen the standard deviations, and errors of fixes that last
+    do. A large fault leaks into the estimates of the others.
     """
     if state.stamp - state.installation.checked < CHECK_INTERVAL:
         return
     state.installation.checked = state.stamp
     for source in range(SOURCES):
         excess = max(1.0, max(state.scatter.velocity[source], state.scatter.spread[source]))
+        together = fixes_together(state, source)
         covariance = work.fault_covariance
         for k in range(FAULTS):
             for m in range(FAULTS):
@@ -232,13 +239,25 @@ def find_faults(state, work):
             for m in range(FAULTS):
                 estimate += covariance[k, m] * state.installation.evidence[source, m]
             state.installation.found[source, k] = estimate
-            state.installation.sigma[source, k] = math.sqrt(covariance[k, k] * excess)
+            widening = excess if k == VELOCITY_TIME else excess + together
+            state.installation.sigma[source, k] = math.sqrt(covariance[k, k] * widening)
             largest = max(largest, abs(estimate) / state.installation.sigma[source, k])
         for k in range(FAULTS):
             least = TIME_ERROR if k >= POSITION_TIME else LEVER_ARM_ERROR
             estimate, sigma = state.installation.found[source, k], state.installation.sigma[source, k]
             if abs(estimate) < max(FAULT_SIGMAS, LEAKAGE * largest) * sigma or abs(estimate) < least:
                 state.installation.found[source, k] = 0.0
+
+
+@njit
+def fixes_together(state, source):
+    """Return how many times the variance of a mean of fixes is that of independent ones: their errors last.
+
+    Of a Gauss-Markov error it is twice its time over the interval of the fixes (Papoulis, Probability, Random Variables
+    and Stochastic Processes, on ergodicity of the mean).
+    """
+    interval = max(1e-9 * state.recovery.absolute_interval, LEAST_INTERVAL)
+    return 2.0 * LASTING_TIME / interval * state.scatter.calm[source]
 
 
 @njit
