@@ -248,7 +248,7 @@ _NEVER = {
     ),
     "trust": ("doubt_stamp",),
     "corrections": ("since",),
-    "scatter": ("last_stamp",),
+    "scatter": ("last_stamp", "walk_stamp"),
     "installation": ("stamp", "checked"),
     "mag": ("disturbed_stamp",),
     "heading": ("given_stamp",),

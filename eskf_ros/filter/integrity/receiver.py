@@ -32,6 +32,9 @@ from eskf_ros.filter.integrity.scatter import (
     learn_from_change,
     learn_from_fix,
     learn_from_velocity,
+    learn_walk,
+    note_claims,
+    propagate_walk,
     update_shares,
 )
 from eskf_ros.filter.measurements.kalman_update import apply, judge, project, update
@@ -66,19 +69,26 @@ def fuse_receiver(states, aid, gate, settings, work):
     start(states, settings)
     heard = is_running(states)
     jumps, believed, humble_nis, humble_log = False, False, 0.0, 0.0
+    is_position = aid.stream == Stream.GNSS_POSITION
+    if is_position:
+        propagate_walk(state, state, aid.source)
     if heard:
+        if is_position:
+            propagate_walk(state, humble, aid.source)
         copy_scatter(state, humble, aid.source)
         jumps, believed, humble_nis, humble_log = hear(states, aid, gate, settings, work)
         if believed:
             reset_to_humble_lane(states)
         if humble.heading_known == 0:
             heard = False
-        elif jumps and aid.stream == Stream.GNSS_POSITION:
+        elif jumps and is_position:
             learn_from_change(state, humble, aid.source, False, settings, work)
             update_shares(state, humble, aid.source, settings, work)
         elif not jumps:
             learn(state, humble, aid, humble_nis, settings, work)
     size = linearize(state, aid, settings, work)
+    if is_position:
+        note_claims(state, aid.source, settings, work)
     for k in range(size):
         aid.innovation[k] = work.innovation[k]
     aid.dof = size
@@ -102,9 +112,10 @@ def fuse_receiver(states, aid, gate, settings, work):
     else:
         aid.verdict = Verdict.GATE
     is_fused = believed or aid.verdict in (Verdict.FUSED, Verdict.WEIGHED_DOWN)
-    if is_fused and aid.stream == Stream.GNSS_POSITION:
-        follow_calm_error(state, aid.source, settings, work)
-    if state.heading_known == 0 and aid.stream == Stream.GNSS_POSITION and not believed:
+    if is_fused and is_position:
+        follow_calm_error(state, aid.source, work)
+        learn_walk(state, aid.source, settings, work)
+    if state.heading_known == 0 and is_position and not believed:
         learn_from_change(state, state, aid.source, is_fused, settings, work)
         update_shares(state, state, aid.source, settings, work)
     if heard and not jumps and not believed:

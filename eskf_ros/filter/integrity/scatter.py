@@ -29,10 +29,15 @@ SCATTER = np.dtype(
         ("change", "f8", (SOURCES,)),
         ("pairs", "f8", (SOURCES,)),
         ("recent", "f8", (SOURCES, 2)),
+        ("walk", "f8", (SOURCES,)),
+        ("walk_stamp", "i8", (SOURCES,)),
+        ("walk_residual", "f8", (SOURCES, 3)),
+        ("last_change", "f8", (SOURCES, 3)),
         ("velocity", "f8", (SOURCES,)),
         ("white", "f8", (SOURCES,)),
         ("lasting", "f8", (SOURCES,)),
         ("calm", "f8", (SOURCES,)),
+        ("walking", "f8", (SOURCES,)),
         ("share", "f8", (SOURCES, 3)),
         ("claimed", "f8", (SOURCES, 3)),
         ("last_stamp", "i8", (SOURCES,)),
@@ -44,9 +49,12 @@ SCATTER = np.dtype(
 
 - ``spread``, ``velocity``: of the innovations of positions and velocities in the humble lane.
 - ``change``, ``pairs``: of the differences of the errors of two consecutive fixes, in which those that last cancel, and the number of pairs.
-- ``recent``: the last two of these differences, the older one first.
+- ``recent``: the last two of these mean squares, the older one first.
+- ``walk``: the part of the squares of the changes that the next change does not take back, over the claimed variance, in
+  the filter; ``walk_stamp``, ``walk_residual``, ``last_change``: of the last fix, as below, and its change (m, map).
 - ``white``, ``lasting``: shares of the claimed variance that are new with each fix, and that last and are estimated.
-- ``calm``: share of the claimed variance that lasts and is followed by the position.
+- ``calm``: share of the claimed variance that lasts and is followed by the position; ``walking``: share by which it grows
+  from fix to fix.
 - ``share``, ``claimed``: share of the position that comes from the fixes, and the variance they claim (m2; per axis of
   map).
 - ``last_stamp``, ``last_residual``: of the last fix: its stamp (ns), and how far it was from the position of the humble
@@ -77,8 +85,23 @@ LONGEST_PAIR = 2_500_000_000
 NOTABLE_SCATTER = 2.0
 """Ratio of the scatter of messages to the variance they claim above which it counts instead of the claim."""
 
+NOTABLE_WALK = 0.5
+"""Ratio of the part of the changes that is not taken back to the variance that fixes claim above which they walk."""
+
+WALK_GAIN = 0.005
+"""Least weight of the newest pair in that part: new errors alone give 0 +- 0.14 then."""
+
+WALK_CLIP = 8.0
+"""One pair counts in that part with at most this many times the present changes."""
+
 NOTABLE_CALM = 0.5
 """Ratio of the changes from fix to fix to the variance they claim below which the rest is an error that lasts."""
+
+LEAST_INTERVAL = 0.05
+"""s; shortest interval of fixes."""
+
+LEAST_LASTING = 0.5
+"""Least share of a lasting error that is worth the augmented states."""
 
 STEADY = 2.0
 """The lasting share follows what is found only when it is off by this factor: it is a scale of augmented states."""
@@ -115,6 +138,8 @@ def forget_scatter(state, lane, source, settings):
     state.scatter.white[source] = 1.0
     state.scatter.pairs[source] = 0.0
     state.scatter.recent[source] = 0.0
+    state.scatter.walk[source] = 0.0
+    state.scatter.walking[source] = 0.0
 
 
 @njit
@@ -147,10 +172,8 @@ def learn_from_velocity(state, source, nis):
 def learn_from_fix(state, lane, source, settings, work):
     """Learn from a fix in the humble ``lane`` how far fixes are from the path, and how they change."""
     used, _ = noise_shares(state, source, settings)
-    # Without velocities that confirm the path, the path may be wrong and not the fixes; so it may in doubt, or when the
-    # last fix is long ago.
     is_next = state.stamp - state.scatter.last_stamp[source] <= LONGEST_PAIR
-    if is_next and state.doubt == 0.0 and is_live(state, Stream.GNSS_VELOCITY.value, source):
+    if is_next and is_path_confirmed(state, source):
         away = distance_from_path(lane, source, settings, work)
         state.scatter.spread[source] = running_mean(state.scatter.spread[source], used * away, SPREAD_GAIN)
     learn_from_change(state, lane, source, True, settings, work)
@@ -164,23 +187,15 @@ def learn_from_change(state, lane, source, is_fused, settings, work):
     its innovation and of what the fix before has left after its correction is that of the errors of the two fixes, but
     for the error of the velocity in between; a lasting error cancels.
     """
-    scatter, place = state.scatter, settings.position_error_at
+    scatter = state.scatter
     used, _ = noise_shares(state, source, settings)
     dt = (state.stamp - scatter.last_stamp[source]) * 1e-9
     change, is_wide = 0.0, False
     for i in range(3):
         noise, drift = work.noise[i, i], lane.covariance[VELOCITY + i, VELOCITY + i] * dt * dt
-        before = work.innovation[i]
-        if place < lane.error_size:
-            correction = work.correction[place + i] if is_fused else 0.0
-            before += work.jacobian[i, place + i] * (lane.optional[place - ERROR_SIZE + i] - correction)
-        difference = before - scatter.last_residual[source, i]
+        difference = error_change(lane, scatter.last_residual[source], i, is_fused, settings, work)
         change += difference * difference / (2.0 * noise + drift) / 3.0
         is_wide |= drift > noise / used
-        scatter.last_residual[source, i] = before
-        for j in range(ERROR_SIZE):
-            if is_fused:
-                scatter.last_residual[source, i] -= work.jacobian[i, j] * work.correction[j]
     is_next = state.stamp - scatter.last_stamp[source] <= LONGEST_PAIR
     scatter.last_stamp[source] = state.stamp
     if not is_next:
@@ -194,6 +209,60 @@ def learn_from_change(state, lane, source, is_fused, settings, work):
     scatter.change[source] = running_mean(scatter.change[source], found, gain, usual)
     scatter.recent[source, 0] = scatter.recent[source, 1]
     scatter.recent[source, 1] = found
+
+
+@njit
+def error_change(lane, residual, i, is_fused, settings, work):
+    """Return the change (m) on an axis of map from the error of the last fix to that of the fix in ``work``.
+
+    ``residual`` (m, 3) is what the last fix had left; that of the new one replaces it on this axis.
+    """
+    place = settings.position_error_at
+    left = work.innovation[i]
+    if place < lane.error_size:
+        correction = work.correction[place + i] if is_fused else 0.0
+        left += work.jacobian[i, place + i] * (lane.optional[place - ERROR_SIZE + i] - correction)
+    change = left - residual[i]
+    if is_fused:
+        for j in range(ERROR_SIZE):
+            left -= work.jacobian[i, j] * work.correction[j]
+    residual[i] = left
+    return change
+
+
+@njit
+def learn_walk(state, source, settings, work):
+    """Learn from a fix that the filter has just fused which part of the changes of the fixes is not taken back.
+
+    Errors that are new with each fix are taken back by the next change: their changes d and d' have the mean product
+    -w, w being their variance (as in the Allan variance). What remains of d d is an error that walks away.
+    """
+    scatter = state.scatter
+    dt = (state.stamp - scatter.walk_stamp[source]) * 1e-9
+    walk, is_wide = 0.0, False
+    for i in range(3):
+        noise, drift = scatter.claimed[source, i], state.covariance[VELOCITY + i, VELOCITY + i] * dt * dt
+        change, last = error_change(state, scatter.walk_residual[source], i, True, settings, work), scatter.last_change
+        walk += (change * change + 2.0 * change * last[source, i] - 3.0 * drift) / (3.0 * noise)
+        last[source, i] = change
+        is_wide |= drift > noise
+    is_next = state.stamp - scatter.walk_stamp[source] <= LONGEST_PAIR
+    scatter.walk_stamp[source] = state.stamp
+    if not is_next:
+        scatter.last_change[source] = 0.0
+    elif not is_wide and is_path_confirmed(state, source):
+        limit = WALK_CLIP * max(1.0, scatter.change[source])
+        gain = max(1.0 / max(scatter.pairs[source], FEWEST_PAIRS), WALK_GAIN)
+        scatter.walk[source] += gain * (min(max(walk, -limit), limit) - scatter.walk[source])
+
+
+@njit
+def is_path_confirmed(state, source):
+    """Say whether the path is known well enough to say that fixes are off: velocities confirm it, and nothing doubts.
+
+    Else the path may be wrong and not the fixes.
+    """
+    return state.doubt == 0.0 and is_live(state, Stream.GNSS_VELOCITY.value, source)
 
 
 @njit
@@ -220,13 +289,17 @@ def update_shares(state, lane, source, settings, work):
         return
     used = scatter.white[source]
     change, spread = scatter.change[source], scatter.spread[source]
-    scatter.white[source] = change if change > NOTABLE_SCATTER else 1.0
+    walks = scatter.walk[source] > NOTABLE_WALK * change
+    new = max(change - 0.5 * scatter.walk[source], 1.0) if walks else change
+    scatter.walking[source] = scatter.walk[source] if walks else 0.0
+    scatter.white[source] = new if new > NOTABLE_SCATTER else 1.0
     found = max(spread if spread > NOTABLE_SCATTER else 1.0, scatter.white[source]) - scatter.white[source]
     off = unmodelled_position(state, source)
     claimed = (work.noise[0, 0] + work.noise[1, 1]) / (2.0 * max(used, LEAST_WHITE))
     found = max(found, min(off * off / claimed, LARGEST_SPREAD))
     lasting = scatter.lasting[source]
     found = max(found, lasting * largest_square(state, settings.position_error_at) / LARGEST_VALUE**2)
+    found = found if found > LEAST_LASTING else 0.0
     if found > STEADY * lasting or found * STEADY < lasting:
         scatter.lasting[source] = found
         if found > 0.0:
@@ -234,25 +307,43 @@ def update_shares(state, lane, source, settings, work):
             inflate_lasting_error(state, lasting, found, factor, settings, work)
             if state.heading_known == 1:
                 inflate_lasting_error(lane, lasting, found, factor, settings, work)
-    is_calm = change < NOTABLE_CALM and scatter.lasting[source] == 0.0
-    scatter.calm[source] = 1.0 - change if is_calm else 0.0
+    calm = 1.0 - change if change < NOTABLE_CALM else 0.0
+    if walks:
+        interval = max(1e-9 * state.recovery.absolute_interval, LEAST_INTERVAL)
+        # A Gauss-Markov error of variance v walks by 2 v / time in a second.
+        steps = 1.0 / (settings.optional_decay[settings.position_error_at - ERROR_SIZE] * interval)
+        calm = min(0.5 * scatter.walk[source] * steps, LARGEST_SPREAD)
+    scatter.calm[source] = calm if scatter.lasting[source] == 0.0 else 0.0
 
 
 @njit
-def follow_calm_error(state, source, settings, work):
+def note_claims(state, source, settings, work):
+    """Note the variances that the fix in ``work`` claims."""
+    white, _ = noise_shares(state, source, settings)
+    for i in range(3):
+        state.scatter.claimed[source, i] = work.noise[i, i] / white
+
+
+@njit
+def propagate_walk(state, lane, source):
+    """Let the position of a lane walk with the errors of the fixes since the last one: it follows them."""
+    for i in range(3):
+        lane.covariance[POSITION + i, POSITION + i] += state.scatter.walking[source] * state.scatter.claimed[source, i]
+
+
+@njit
+def follow_calm_error(state, source, work):
     """Update how much of the position comes from the lasting errors of the fixes, after a fix has been fused.
 
-    ``work`` holds its gain and its noise. A constant error of the fixes comes into the position as the fixes do, and the
+    ``work`` holds its gain. A constant error of the fixes comes into the position as the fixes do, and the
     IMU knows nothing of it: a <- (1 - K) a + K.
     """
     scatter = state.scatter
-    white, _ = noise_shares(state, source, settings)
     for i in range(3):
         gain = work.gain[POSITION + i, i]
         for other in range(SOURCES):
             scatter.share[other, i] *= 1.0 - gain
         scatter.share[source, i] += gain
-        scatter.claimed[source, i] = work.noise[i, i] / white
 
 
 @njit
