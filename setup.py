@@ -101,6 +101,7 @@ setup(
             "eskf_check = eskf_ros.doctor.main:main",
             "eskf_ranges = eskf_ros.inputs.ranges_command:main",
             "eskf_simulate = eskf_ros.simulate.main:main",
+            "eskf_migrate = eskf_ros.migrate.main:main",
         ],
     },
     zip_safe=True,

@@ -45,10 +45,33 @@ def load(path: str | PathLike[str], node_name: str = "eskf_node") -> Parameters:
     Raises ParameterError (naming the file and every mistake in it) for a file that cannot be read, is no YAML, has no
     section for this node, or fails `from_mapping`.
     """
-    path = Path(path)
-    source = str(path)
+    source = str(Path(path))
+    sections = read_sections(path)
+    applying = [(name, content) for name, content in sections if _applies(name, node_name)]
+    if not applying:
+        names = ", ".join(name for name, _ in sections)
+        raise ParameterError(source, [f"no section applies to node {node_name}; the sections are {names}"])
+    concrete = sorted({name for name, _ in applying if "*" not in name})
+    if len(concrete) > 1:
+        raise ParameterError(
+            source, [f"sections for several nodes called {node_name}: {', '.join(concrete)}; keep one"]
+        )
+    merged: dict[str, object] = {}
+    for name, content in applying:
+        if content is None:
+            raise ParameterError(source, [f"{name}: nothing below 'ros__parameters:'"])
+        merged.update(content)
+    return from_mapping(merged, source)
+
+
+def read_sections(path: str | PathLike[str]) -> list[tuple[str, dict[str, object] | None]]:
+    """Return the sections of a ROS 2 parameter file: name of the node, and values by dotted name (None: nothing in it).
+
+    Raises ParameterError for a file that cannot be read, is no YAML, or has no section.
+    """
+    source = str(Path(path))
     try:
-        document = yaml.load(path.read_text(encoding="utf-8"), Loader=_RosLoader)
+        document = yaml.load(Path(path).read_text(encoding="utf-8"), Loader=_RosLoader)
     except OSError as error:
         raise ParameterError(source, [f"cannot read the parameter file: {error.strerror}"]) from error
     except UnicodeDecodeError as error:
@@ -61,21 +84,7 @@ def load(path: str | PathLike[str], node_name: str = "eskf_node") -> Parameters:
     sections = list(_sections(document, ""))
     if not sections:
         raise ParameterError(source, [f"no 'ros__parameters:' found; {wanted}"])
-    applying = [(name, content) for name, content in sections if _applies(name, node_name)]
-    if not applying:
-        names = ", ".join(name for name, _ in sections)
-        raise ParameterError(source, [f"no section applies to node {node_name}; the sections are {names}"])
-    concrete = sorted({name for name, _ in applying if "*" not in name})
-    if len(concrete) > 1:
-        raise ParameterError(
-            source, [f"sections for several nodes called {node_name}: {', '.join(concrete)}; keep one"]
-        )
-    merged: dict[str, object] = {}
-    for name, content in applying:
-        if not isinstance(content, Mapping):
-            raise ParameterError(source, [f"{name}: nothing below 'ros__parameters:'"])
-        merged.update(flat(content, source))
-    return from_mapping(merged, source)
+    return [(name, flat(content, source) if isinstance(content, Mapping) else None) for name, content in sections]
 
 
 def _sections(document: Mapping[str, object], namespace: str) -> Iterator[tuple[str, object]]:

@@ -35,7 +35,7 @@ FLOORS = (
     ("filter.readout",),
     ("filter.navigator",),
     ("filter.warm_up", "inputs"),
-    ("replay", "simulate"),
+    ("replay", "simulate", "migrate"),
     ("tables", "doctor"),
     ("api",),
     ("ros_node",),
