@@ -53,6 +53,8 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{package_name}"]),
         (f"share/{package_name}", ["package.xml"]),
         (f"share/{package_name}/config", sorted(glob("config/*.yaml"))),
+        (f"share/{package_name}/config/nav2", sorted(glob("config/nav2/*.yaml"))),
+        (f"share/{package_name}/config/profiles", sorted(glob("config/profiles/*.yaml"))),
         (f"share/{package_name}/bags", sorted(glob("bags/*.mcap") + glob("bags/*.nav"))),
         (f"share/{package_name}/launch", sorted(glob("launch/*.launch.py"))),
     ],

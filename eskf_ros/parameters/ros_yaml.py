@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 
 from eskf_ros.parameters.mapping import flat, from_mapping
+from eskf_ros.parameters.profiles import profile_path
 from eskf_ros.parameters.schema import ParameterError
 from eskf_ros.parameters.tree import Parameters
 
@@ -35,17 +36,27 @@ _RosLoader.add_implicit_resolver(
 )
 
 
-def load(path: str | PathLike[str], node_name: str = "eskf_node") -> Parameters:
-    """Return the parameters of a ROS 2 parameter file.
+def load(path: str | PathLike[str] | None, node_name: str = "eskf_node", profile: str = "") -> Parameters:
+    """Return the parameters of a ROS 2 parameter file, over those of a profile if one is named.
 
     Sections apply as in ROS: `/**`, `/*`, `eskf_node`, `/robot/eskf_node`, or nested namespaces; sections of other
     nodes are ignored; if several apply, the later one in the file wins. A `node_name` without a leading slash stands
     for the node in any single namespace that the file uses.
 
     Raises ParameterError (naming the file and every mistake in it) for a file that cannot be read, is no YAML, has no
-    section for this node, or fails `from_mapping`.
+    section for this node, or fails `from_mapping`; and for a profile that is not there.
     """
-    source = str(Path(path))
+    paths = [profile_path(profile)] if profile else []
+    paths += [Path(path)] if path else []
+    merged: dict[str, object] = {}
+    for each in paths:
+        merged.update(_values(each, node_name))
+    return from_mapping(merged, ", ".join(map(str, paths)))
+
+
+def _values(path: Path, node_name: str) -> dict[str, object]:
+    """Return the values that a file gives to a node, by dotted name."""
+    source = str(path)
     sections = read_sections(path)
     applying = [(name, content) for name, content in sections if _applies(name, node_name)]
     if not applying:
@@ -61,11 +72,11 @@ def load(path: str | PathLike[str], node_name: str = "eskf_node") -> Parameters:
         if content is None:
             raise ParameterError(source, [f"{name}: nothing below 'ros__parameters:'"])
         merged.update(content)
-    return from_mapping(merged, source)
+    return merged
 
 
 def read_sections(path: str | PathLike[str]) -> list[tuple[str, dict[str, object] | None]]:
-    """Return the sections of a ROS 2 parameter file: name of the node, and values by dotted name (None: nothing in it).
+    """Return the sections of a ROS 2 parameter file: node and values by dotted name (None: there is nothing in it).
 
     Raises ParameterError for a file that cannot be read, is no YAML, or has no section.
     """

@@ -10,10 +10,11 @@ from typing import Any
 from eskf_ros.ros_node.process import StartError, StopFlag, run
 
 USAGE = """\
-usage: eskf_node [--ros-args --params-file FILE -p NAME:=VALUE -r FROM:=TO ...]
+usage: eskf_node [--profile NAME] [--ros-args --params-file FILE -p NAME:=VALUE -r FROM:=TO ...]
 
 Error-state Kalman filter: imu/data and gps/fix (gps/vel) in, odometry/global and odometry/local out at IMU rate.
-config/eskf.yaml lists every parameter.
+config/eskf.yaml lists every parameter. --profile takes those for a kind of robot (car, mower, vessel ...; see
+docs/profiles.md); what is given after --ros-args goes before them.
 
        eskf_node --compile
 
@@ -43,11 +44,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from eskf_ros.parameters.schema import ParameterError
 
     try:
-        run(_create, stop, arguments)
+        run(_create, stop, with_profile(sys.argv if arguments is None else words))
     except (ParameterError, StartError) as error:
         print(f"eskf_node: {error}", file=sys.stderr)
         return 2
     return 0
+
+
+def with_profile(words: Sequence[str]) -> list[str]:
+    """Return the arguments with `--profile NAME` as a parameter file before all others.
+
+    Of two values for a parameter ROS takes the later one. Raises ParameterError for a profile that is not there.
+    """
+    place = next((number for number, word in enumerate(words) if word == "--profile"), None)
+    if place is None:
+        return list(words)
+    from eskf_ros.parameters.profiles import profile_path
+
+    name = words[place + 1] if place + 1 < len(words) else ""
+    file = ["--ros-args", "--params-file", str(profile_path(name)), "--"]
+    return [*words[:place], *file, *words[place + 2 :]]
 
 
 def _compile() -> int:
