@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _EPILOG = """\
 results, in DIR/<bag name>_eskf/ (files of an earlier replay are replaced):
-  odometry.mcap   odometry/global and gps/filtered; opens in Foxglove
+  odometry.mcap   odometry, fixes, verdicts, biases, diagnostics, path and truth, for Foxglove and others
   trajectory.tum  t x y z qx qy qz qw: base_link in map as it was published at that time, from the first known position
   aids.csv        one line per GNSS message or signal: stamp, arrival, aid, innovation, NIS, degrees of freedom, verdict
   summary.json    everything in numbers
