@@ -36,7 +36,7 @@ FLOORS = (
     ("filter.navigator",),
     ("filter.warm_up", "inputs"),
     ("replay", "simulate", "migrate"),
-    ("tables", "doctor"),
+    ("tables", "doctor", "watch"),
     ("api",),
     ("ros_node",),
 )
