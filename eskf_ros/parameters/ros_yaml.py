@@ -46,12 +46,15 @@ def load(path: str | PathLike[str] | None, node_name: str = "eskf_node", profile
     Raises ParameterError (naming the file and every mistake in it) for a file that cannot be read, is no YAML, has no
     section for this node, or fails `from_mapping`; and for a profile that is not there.
     """
-    paths = [profile_path(profile)] if profile else []
-    paths += [Path(path)] if path else []
-    merged: dict[str, object] = {}
-    for each in paths:
-        merged.update(_values(each, node_name))
-    return from_mapping(merged, ", ".join(map(str, paths)))
+    merged = profile_values(profile) if profile else {}
+    if path:
+        merged |= _values(Path(path), node_name)
+    return from_mapping(merged, str(path or f"profile {profile}"))
+
+
+def profile_values(profile: str) -> dict[str, object]:
+    """Return the values of a profile by dotted name. Raises ParameterError if there is none of this name."""
+    return _values(profile_path(profile), "eskf_node")
 
 
 def _values(path: Path, node_name: str) -> dict[str, object]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 from eskf_ros.ros_node.process import StartError, StopFlag, run
@@ -44,26 +45,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from eskf_ros.parameters.schema import ParameterError
 
     try:
-        run(_create, stop, with_profile(sys.argv if arguments is None else words))
+        profile, others = taken_profile(sys.argv if arguments is None else words)
+        run(partial(_create, profile), stop, others)
     except (ParameterError, StartError) as error:
         print(f"eskf_node: {error}", file=sys.stderr)
         return 2
     return 0
 
 
-def with_profile(words: Sequence[str]) -> list[str]:
-    """Return the arguments with `--profile NAME` as a parameter file before all others.
+def taken_profile(words: Sequence[str]) -> tuple[str, list[str]]:
+    """Return the NAME of `--profile NAME`, empty without, and the other arguments.
 
-    Of two values for a parameter ROS takes the later one. Raises ParameterError for a profile that is not there.
+    It is not given to ROS as one more parameter file: there the order of files and arguments decides, here it is below
+    all of them.
     """
-    place = next((number for number, word in enumerate(words) if word == "--profile"), None)
-    if place is None:
-        return list(words)
-    from eskf_ros.parameters.profiles import profile_path
-
-    name = words[place + 1] if place + 1 < len(words) else ""
-    file = ["--ros-args", "--params-file", str(profile_path(name)), "--"]
-    return [*words[:place], *file, *words[place + 2 :]]
+    if "--profile" not in words:
+        return "", list(words)
+    place = list(words).index("--profile")
+    return (words[place + 1] if place + 1 < len(words) else "?"), [*words[:place], *words[place + 2 :]]
 
 
 def _compile() -> int:
@@ -92,13 +91,13 @@ def _compile() -> int:
     return 0
 
 
-def _create() -> Any:
+def _create(profile: str) -> Any:
     from rclpy.exceptions import ParameterException
 
     from eskf_ros.ros_node.node import EskfNode
 
     try:
-        return EskfNode()
+        return EskfNode(profile=profile)
     except (ParameterException, RuntimeError) as error:
         # Wrong parameters of rclpy itself, such as qos_overrides, and invalid names.
         raise StartError(error) from error

@@ -20,7 +20,6 @@ from eskf_ros.parameters.schema import ParameterError
 from eskf_ros.parameters.tree import Parameters
 from eskf_ros.replay.main import main as replay
 from eskf_ros.ros_node.main import main as node
-from eskf_ros.ros_node.main import with_profile
 from eskf_ros.simulate.main import main as simulate
 
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -161,13 +160,6 @@ def test_a_name_that_is_no_profile_is_a_mistake_that_names_them(
     pytest.importorskip("rclpy")
     assert node(["--profile", "bicycle"]) == 2
     assert "there is no such profile" in capsys.readouterr().err
-
-
-def test_the_node_reads_the_profile_before_the_files_of_the_user() -> None:
-    words = with_profile(["eskf_node", "--profile", "car", "--ros-args", "--params-file", "own.yaml"])
-    path = str(profile_path("car"))
-    assert words == ["eskf_node", "--ros-args", "--params-file", path, "--", "--ros-args", "--params-file", "own.yaml"]
-    assert with_profile(["eskf_node", "--ros-args", "-p", "mode:=tight"])[1:] == ["--ros-args", "-p", "mode:=tight"]
 
 
 def test_the_document_lists_every_profile() -> None:
