@@ -21,6 +21,9 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument(
                 "params_file", default_value="", description="Parameters of the node, a YAML file; empty: the defaults."
             ),
+            DeclareLaunchArgument(
+                "profile", default_value="", description="Parameters for a kind of robot, below those of params_file."
+            ),
             DeclareLaunchArgument("namespace", default_value="", description="Namespace of the node and its topics."),
             DeclareLaunchArgument(
                 "use_sim_time", default_value="", description="true: time from /clock; empty: as in params_file."
@@ -47,6 +50,7 @@ def start_node(context: LaunchContext) -> list[Node]:
     params_file = LaunchConfiguration("params_file").perform(context)
     if params_file and not Path(params_file).is_file():  # launch_ros would warn and run the robot on the defaults
         raise FileNotFoundError(f"params_file: there is no file {params_file}")
+    profile = LaunchConfiguration("profile").perform(context)
     parameters: list[Any] = [params_file] if params_file else []
     for argument, parameter, kind in (("use_sim_time", "use_sim_time", bool), ("tf", "output.tf", str)):
         if LaunchConfiguration(argument).perform(context):
@@ -57,6 +61,7 @@ def start_node(context: LaunchContext) -> list[Node]:
             executable="eskf_node",
             name="eskf_node",
             namespace=LaunchConfiguration("namespace"),
+            arguments=["--profile", profile] if profile else [],
             parameters=parameters,
             ros_arguments=["--log-level", LaunchConfiguration("log_level")],
             output="screen",

@@ -87,8 +87,10 @@ class _Summary:
 class BagWriter:
     """Writes one .mcap file; a context manager. After an exception inside the file has no index, but can be read."""
 
-    def __init__(self, path: Path, compression: str = "zstd") -> None:
+    def __init__(self, path: Path, compression: str = "zstd", namespace: str = "") -> None:
         """Create the file, replacing one of that name. `compression` is zstd, lz4 or none.
+
+        `namespace` is put before the names of topics: with a slash they are named as `ros2 bag record` does.
 
         Raises:
             BagError: the file cannot be created.
@@ -97,6 +99,7 @@ class BagWriter:
         if compression not in ("zstd", "lz4", "none"):
             raise ValueError(f"compression is zstd, lz4 or none, not {compression!r}")
         self.path = path
+        self._namespace = namespace
         self._compression = "" if compression == "none" else compression
         self._topics: list[_Topic] = []
         self._schemas: dict[str, Schema] = {}
@@ -130,6 +133,7 @@ class BagWriter:
         """
         from rosbags.typesys import Stores, get_typestore
 
+        name = self._namespace + name
         if any(topic.name == name for topic in self._topics):
             raise BagError(f"{self.path}: topic {name} is added twice")
         store = get_typestore(Stores.ROS2_JAZZY)

@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 
 from eskf_ros.parameters.mapping import flat, from_mapping
+from eskf_ros.parameters.profiles import profile_path
 from eskf_ros.parameters.schema import ParameterError
 from eskf_ros.parameters.tree import Parameters
 
@@ -35,20 +36,56 @@ _RosLoader.add_implicit_resolver(
 )
 
 
-def load(path: str | PathLike[str], node_name: str = "eskf_node") -> Parameters:
-    """Return the parameters of a ROS 2 parameter file.
+def load(path: str | PathLike[str] | None, node_name: str = "eskf_node", profile: str = "") -> Parameters:
+    """Return the parameters of a ROS 2 parameter file, over those of a profile if one is named.
 
     Sections apply as in ROS: `/**`, `/*`, `eskf_node`, `/robot/eskf_node`, or nested namespaces; sections of other
     nodes are ignored; if several apply, the later one in the file wins. A `node_name` without a leading slash stands
     for the node in any single namespace that the file uses.
 
     Raises ParameterError (naming the file and every mistake in it) for a file that cannot be read, is no YAML, has no
-    section for this node, or fails `from_mapping`.
+    section for this node, or fails `from_mapping`; and for a profile that is not there.
     """
-    path = Path(path)
+    merged = profile_values(profile) if profile else {}
+    if path:
+        merged |= _values(Path(path), node_name)
+    return from_mapping(merged, str(path or f"profile {profile}"))
+
+
+def profile_values(profile: str) -> dict[str, object]:
+    """Return the values of a profile by dotted name. Raises ParameterError if there is none of this name."""
+    return _values(profile_path(profile), "eskf_node")
+
+
+def _values(path: Path, node_name: str) -> dict[str, object]:
+    """Return the values that a file gives to a node, by dotted name."""
     source = str(path)
+    sections = read_sections(path)
+    applying = [(name, content) for name, content in sections if _applies(name, node_name)]
+    if not applying:
+        names = ", ".join(name for name, _ in sections)
+        raise ParameterError(source, [f"no section applies to node {node_name}; the sections are {names}"])
+    concrete = sorted({name for name, _ in applying if "*" not in name})
+    if len(concrete) > 1:
+        raise ParameterError(
+            source, [f"sections for several nodes called {node_name}: {', '.join(concrete)}; keep one"]
+        )
+    merged: dict[str, object] = {}
+    for name, content in applying:
+        if content is None:
+            raise ParameterError(source, [f"{name}: nothing below 'ros__parameters:'"])
+        merged.update(content)
+    return merged
+
+
+def read_sections(path: str | PathLike[str]) -> list[tuple[str, dict[str, object] | None]]:
+    """Return the sections of a ROS 2 parameter file: node and values by dotted name (None: there is nothing in it).
+
+    Raises ParameterError for a file that cannot be read, is no YAML, or has no section.
+    """
+    source = str(Path(path))
     try:
-        document = yaml.load(path.read_text(encoding="utf-8"), Loader=_RosLoader)
+        document = yaml.load(Path(path).read_text(encoding="utf-8"), Loader=_RosLoader)
     except OSError as error:
         raise ParameterError(source, [f"cannot read the parameter file: {error.strerror}"]) from error
     except UnicodeDecodeError as error:
@@ -61,21 +98,7 @@ def load(path: str | PathLike[str], node_name: str = "eskf_node") -> Parameters:
     sections = list(_sections(document, ""))
     if not sections:
         raise ParameterError(source, [f"no 'ros__parameters:' found; {wanted}"])
-    applying = [(name, content) for name, content in sections if _applies(name, node_name)]
-    if not applying:
-        names = ", ".join(name for name, _ in sections)
-        raise ParameterError(source, [f"no section applies to node {node_name}; the sections are {names}"])
-    concrete = sorted({name for name, _ in applying if "*" not in name})
-    if len(concrete) > 1:
-        raise ParameterError(
-            source, [f"sections for several nodes called {node_name}: {', '.join(concrete)}; keep one"]
-        )
-    merged: dict[str, object] = {}
-    for name, content in applying:
-        if not isinstance(content, Mapping):
-            raise ParameterError(source, [f"{name}: nothing below 'ros__parameters:'"])
-        merged.update(flat(content, source))
-    return from_mapping(merged, source)
+    return [(name, flat(content, source) if isinstance(content, Mapping) else None) for name, content in sections]
 
 
 def _sections(document: Mapping[str, object], namespace: str) -> Iterator[tuple[str, object]]:

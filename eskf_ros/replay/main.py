@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 _EPILOG = """\
 results, in DIR/<bag name>_eskf/ (files of an earlier replay are replaced):
-  odometry.mcap   odometry/global and gps/filtered; opens in Foxglove
+  odometry.mcap   odometry, fixes, verdicts, biases, diagnostics, path and truth, for Foxglove and others
   trajectory.tum  t x y z qx qy qz qw: base_link in map as it was published at that time, from the first known position
   aids.csv        one line per GNSS message or signal: stamp, arrival, aid, innovation, NIS, degrees of freedom, verdict
   summary.json    everything in numbers
@@ -102,6 +102,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 directory, .mcap or .db3 file")
     parser.add_argument(
         "--config", type=Path, metavar="FILE", help="parameter file of the node (default: the defaults)"
+    )
+    parser.add_argument(
+        "--profile", default="", metavar="NAME", help="parameters for a kind of robot, below those of --config"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="where the results go (default: next to the bag)")
     parser.add_argument(
@@ -195,7 +198,6 @@ def _say(text: str) -> None:
 def _run(options: argparse.Namespace) -> int:
     from eskf_ros.parameters.ros_yaml import load
     from eskf_ros.parameters.schema import ParameterError
-    from eskf_ros.parameters.tree import Parameters
 
     folders = [_folder(bag, options.out) for bag in options.bags]
     for folder in folders:
@@ -204,7 +206,7 @@ def _run(options: argparse.Namespace) -> int:
                 f"two of the recordings would write to {folder}; replay them one by one with different --out"
             )
     try:
-        parameters = load(options.config) if options.config else Parameters()
+        parameters = load(options.config, profile=options.profile)
     except ParameterError as error:
         raise _Mistake("; ".join(str(error).splitlines())) from error
 

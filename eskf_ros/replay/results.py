@@ -17,13 +17,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.bags import BagWriter, message_dtype
+from eskf_ros.bags import BagWriter, Batch, message_dtype
 from eskf_ros.filter.state.enums import STREAM_NAMES, Stream, Verdict
 from eskf_ros.filter.tight.signal import name_of
 from eskf_ros.geodesy.map_frame import MapFrame, to_geodetic
 from eskf_ros.parameters.tree import Frames
 from eskf_ros.replay.topics import FIX, ODOMETRY
+from eskf_ros.replay.truth import EPOCH
 from eskf_ros.replay.tum_writer import tum_text
+from eskf_ros.replay.views import Views, first_in_each
 
 NAMES = ("odometry.mcap", "trajectory.tum", "aids.csv", "summary.json")
 AIDS_HEADER = "stamp,arrival,aid,innovation_0,innovation_1,innovation_2,nis,dof,verdict,source\n"
@@ -47,8 +49,9 @@ class ResultFiles:
     folder cannot be written. `seconds` is the working time of the writing thread.
     """
 
-    def __init__(self, folder: Path, frames: Frames, output_rate: float = 0.0) -> None:
+    def __init__(self, folder: Path, frames: Frames, output_rate: float = 0.0, has_truth: bool = False) -> None:
         self.folder = folder
+        self._frames, self._has_truth = frames, has_truth
         self._strings = (frames.map, frames.base_link)
         self._interval = round(1e9 / output_rate) if output_rate else 0
         self._last_stamp = self._last_fix = -1
@@ -64,9 +67,10 @@ class ResultFiles:
             # Temporary files have their final names, in a folder of their own: odometry.mcap contains its name.
             self._partial = Path(self._all.enter_context(TemporaryDirectory(prefix=".partial-", dir=self.folder)))
             self._all.enter_context(self._files)
-            self._bag = self._files.enter_context(BagWriter(self._partial / "odometry.mcap"))
+            self._bag = self._files.enter_context(BagWriter(self._partial / "odometry.mcap", namespace="/"))
             self._odometry = self._bag.add_topic("odometry/global", ODOMETRY)
             self._fixes = self._bag.add_topic("gps/filtered", FIX)
+            self._views = Views(self._bag, self._frames, self._has_truth)
             self._trajectory = self._files.enter_context((self._partial / "trajectory.tum").open("wb"))
             self._aids = self._files.enter_context((self._partial / "aids.csv").open("w", encoding="ascii"))
             self._aids.write(AIDS_HEADER)
@@ -76,24 +80,50 @@ class ResultFiles:
             raise
         return self
 
-    def write(self, rows: NDArray[Any], records: NDArray[Any], datum: tuple[float, float, float] | None) -> None:
+    def write(
+        self,
+        rows: NDArray[Any],
+        records: NDArray[Any],
+        datum: tuple[float, float, float] | None,
+        fixes: Batch | None = None,
+        truth: NDArray[Any] | None = None,
+    ) -> None:
         """Append RECORD rows (m,) to aids.csv, and ODOMETRY rows (n,) with a known position to the other two files.
+
+        ``fixes`` as they came and truth epochs (k,) go to odometry.mcap, beside the estimate.
 
         A thread does the work, mostly outside Python, while the estimator takes the next batch.
         """
         self._wait()
-        self._writing = self._writer.submit(self._write, rows, records, datum)
+        self._writing = self._writer.submit(self._write, rows, records, datum, fixes, truth)
 
-    def _write(self, rows: NDArray[Any], records: NDArray[Any], datum: tuple[float, float, float] | None) -> None:
+    def _write(
+        self,
+        rows: NDArray[Any],
+        records: NDArray[Any],
+        datum: tuple[float, float, float] | None,
+        fixes: Batch | None,
+        truth: NDArray[Any] | None,
+    ) -> None:
         began = time.perf_counter()
         self._aids.write(aids_lines(records))
-        stamps, known = rows["stamp"], rows["position_known"]
-        if datum is not None and known.any():
-            chosen = selected(rows, known & _first_in_each(stamps, self._last_stamp, self._interval))
+        if fixes is not None:
+            self._views.write_fixes(fixes)
+        if self._has_truth:
+            epochs = np.zeros(0, EPOCH) if truth is None else truth
+            self._views.write_truth(epochs, None if datum is None else MapFrame(datum))
+        stamps = rows["stamp"]
+        if self._last_stamp < 0 and len(rows):
+            # As the navigator: the first row is one only if it begins an interval.
+            self._last_stamp = int(stamps[0]) - 1
+        thinned = selected(rows, first_in_each(stamps, self._last_stamp, self._interval))
+        self._views.write(thinned, records)
+        chosen = selected(thinned, thinned["position_known"])
+        if datum is not None and len(chosen):
             numbers = np.column_stack([chosen["position_map"], chosen["attitude_body_to_map"][:, [1, 2, 3, 0]]])
             self._trajectory.write(tum_text(chosen["stamp"], numbers))
             self._bag.write(self._odometry, chosen["stamp"], odometry_messages(chosen), self._strings)
-            chosen = chosen[_first_in_each(chosen["stamp"], self._last_fix, FIX_INTERVAL)]
+            chosen = chosen[first_in_each(chosen["stamp"], self._last_fix, FIX_INTERVAL)]
             self._bag.write(self._fixes, chosen["stamp"], fix_messages(chosen, MapFrame(datum)), self._strings)
             self._last_fix = int(chosen["stamp"][-1]) if len(chosen) else self._last_fix
         if len(rows):
@@ -108,6 +138,7 @@ class ResultFiles:
         """Complete all files but summary.json; nothing can be appended afterwards."""
         self._wait()
         began = time.perf_counter()
+        self._views.finish()
         self._files.close()
         self.seconds += time.perf_counter() - began
 
@@ -130,16 +161,6 @@ class ResultFiles:
 def selected(rows: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[Any]:
     """Return `rows[mask]`, without a copy if the mask is all true: a row has more than a kilobyte."""
     return rows if mask.all() else rows[mask]
-
-
-def _first_in_each(stamps: NDArray[np.int64], last: int, interval: int) -> NDArray[np.bool_]:
-    """Return which of the increasing `stamps` is the first at or after a multiple of `interval` (ns; 0: all of them).
-
-    `last` is the stamp before the first one.
-    """
-    if interval == 0:
-        return np.ones(len(stamps), bool)
-    return np.diff(stamps // interval, prepend=last // interval) > 0
 
 
 def aids_lines(records: NDArray[Any]) -> str:

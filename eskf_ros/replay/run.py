@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from eskf_ros.bags import BagReader, Batch, open_bag
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.output.global_odometry import ODOMETRY
+from eskf_ros.filter.state.enums import Stream
 from eskf_ros.gnss.rinex import RinexError
 from eskf_ros.inputs.epochs import RangeIntake
 from eskf_ros.inputs.rinex_as_messages import RangesError, merged, read_beside
@@ -97,15 +98,16 @@ def replay(
         truth = TruthComparison(parameters.gnss.lever_arm if topics.truth_type == FIX else (0.0, 0.0, 0.0))
         summary = Summary(feed, options.outages)
 
-        with ResultFiles(options.folder, parameters.frames, options.output_rate if thinned else 0.0) as files:
+        thinning = options.output_rate if thinned else 0.0
+        with ResultFiles(options.folder, parameters.frames, thinning, bool(topics.truth)) as files:
 
-            def collect(rows: NDArray[Any], records: NDArray[Any]) -> None:
+            def collect(rows: NDArray[Any], records: NDArray[Any], *beside: Any) -> None:
                 known, datum = selected(rows, rows["position_known"]), navigator.datum
                 if len(known) and topics.truth and datum:
                     truth.add_rows(known, datum)
                 summary.add(known, records)
                 clock.lap("compare")
-                files.write(rows, records, datum)
+                files.write(rows, records, datum, *beside)
                 clock.lap("wait")
 
             clock.lap("start")
@@ -113,9 +115,10 @@ def replay(
                 clock.lap("read")
                 rows = feed.push(batch)
                 clock.lap("filter")
-                if topics.truth in batch:
-                    truth.add_truth(to_epochs(batch[topics.truth]))
-                collect(rows, navigator.take_records())
+                epochs = to_epochs(batch[topics.truth]) if topics.truth in batch else None
+                if epochs is not None:
+                    truth.add_truth(epochs)
+                collect(rows, navigator.take_records(), batch.get(topics.of(Stream.GNSS_POSITION)), epochs)
                 progress(reader.bytes_done / reader.bytes_total)
             clock.lap("read")
             collect(np.zeros(0, ODOMETRY), navigator.finish())

@@ -9,19 +9,23 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from eskf_ros.parameters.mapping import Leaf, from_mapping, leaves, to_mapping
+from eskf_ros.parameters.ros_yaml import profile_values
 from eskf_ros.parameters.schema import Value
 from eskf_ros.parameters.tree import Parameters
 
 
-def declare(node: Node, source: str = "") -> Parameters:
+def declare(node: Node, source: str = "", profile: str = "") -> Parameters:
     """Declare every parameter on the node; return the values from parameter files and the command line.
+
+    A ``profile`` gives those that neither has.
 
     The overrides are checked as a whole before anything is declared, by the same rules as `--config` of the replay.
     `source` names them in errors (default: the node). Raises ParameterError listing every unknown key (with the closest
     known one), wrong type and value outside its range.
     """
     known = {leaf.name: leaf for leaf in leaves()}
-    given = {name: _given(parameter, known.get(name)) for name, parameter in _overrides(node).items()}
+    given = profile_values(profile) if profile else {}
+    given |= {name: _given(parameter, known.get(name)) for name, parameter in _overrides(node).items()}
     parameters = from_mapping(given, source or f"parameters of {node.get_fully_qualified_name()}")
     for name, value in to_mapping(parameters).items():
         node.declare_parameter(name, _ros_value(value), _descriptor(known[name]), ignore_override=True)

@@ -24,6 +24,7 @@ from eskf_ros.gnss.signals import BEIDOU_3, Gnss
 from eskf_ros.inputs.epochs import RangeIntake
 from eskf_ros.inputs.table import Input
 from eskf_ros.parameters.tree import Parameters
+from eskf_ros.replay import words
 from eskf_ros.ros_node.clocks import StampMonitor, clock_complaints
 from eskf_ros.ros_node.error_counter import Trouble
 from eskf_ros.ros_node.extrinsics import Extrinsics
@@ -254,13 +255,8 @@ def second_publishers(seen: Snapshot) -> list[str]:
 
 def figures(seen: Snapshot, row: np.void) -> dict[str, object]:
     """Return uncertainty, biases, and counts of what was published."""
-    sigma = [math.sqrt(max(0.0, row["pose_covariance"][i, i])) for i in range(6)]
     return {
-        "position std (m)": " ".join(f"{value:.3f}" for value in sigma[:3]),
-        "velocity std (m/s)": " ".join(f"{math.sqrt(max(0.0, row['twist_covariance'][i, i])):.3f}" for i in range(3)),
-        "heading std (deg)": f"{math.degrees(sigma[5]):.2f}",
-        "accelerometer bias (m/s2)": " ".join(f"{value:.4f}" for value in row["accel_bias"]),
-        "gyro bias (rad/s)": " ".join(f"{value:.6f}" for value in row["gyro_bias"]),
+        **words.figures(row),
         "odometries published": seen.outputs.published,
         "restarts": seen.navigator.restarts,
         "position resets": seen.navigator.position_resets,

@@ -5,15 +5,17 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 from eskf_ros.ros_node.process import StartError, StopFlag, run
 
 USAGE = """\
-usage: eskf_node [--ros-args --params-file FILE -p NAME:=VALUE -r FROM:=TO ...]
+usage: eskf_node [--profile NAME] [--ros-args --params-file FILE -p NAME:=VALUE -r FROM:=TO ...]
 
 Error-state Kalman filter: imu/data and gps/fix (gps/vel) in, odometry/global and odometry/local out at IMU rate.
-config/eskf.yaml lists every parameter.
+config/eskf.yaml lists every parameter. --profile takes those for a kind of robot (car, mower, vessel ...; see
+docs/profiles.md); what is given after --ros-args goes before them.
 
        eskf_node --compile
 
@@ -43,11 +45,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from eskf_ros.parameters.schema import ParameterError
 
     try:
-        run(_create, stop, arguments)
+        profile, others = taken_profile(sys.argv if arguments is None else words)
+        run(partial(_create, profile), stop, others)
     except (ParameterError, StartError) as error:
         print(f"eskf_node: {error}", file=sys.stderr)
         return 2
     return 0
+
+
+def taken_profile(words: Sequence[str]) -> tuple[str, list[str]]:
+    """Return the NAME of `--profile NAME`, empty without, and the other arguments.
+
+    It is not given to ROS as one more parameter file: there the order of files and arguments decides, here it is below
+    all of them.
+    """
+    if "--profile" not in words:
+        return "", list(words)
+    place = list(words).index("--profile")
+    return (words[place + 1] if place + 1 < len(words) else "?"), [*words[:place], *words[place + 2 :]]
 
 
 def _compile() -> int:
@@ -76,13 +91,13 @@ def _compile() -> int:
     return 0
 
 
-def _create() -> Any:
+def _create(profile: str) -> Any:
     from rclpy.exceptions import ParameterException
 
     from eskf_ros.ros_node.node import EskfNode
 
     try:
-        return EskfNode()
+        return EskfNode(profile=profile)
     except (ParameterException, RuntimeError) as error:
         # Wrong parameters of rclpy itself, such as qos_overrides, and invalid names.
         raise StartError(error) from error

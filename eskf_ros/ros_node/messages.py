@@ -11,20 +11,13 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from sensor_msgs.msg import NavSatFix, NavSatStatus
 
-from eskf_ros.filter.state.enums import IS_USABLE, QUALITY_REASONS, STREAM_NAMES, Quality, Status, Stream, Verdict
 from eskf_ros.filter.state.time import SECOND
-from eskf_ros.filter.tight.signal import name_of
 from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.gnss.point_solution import PointSolution, SolutionStatus
-
-GOOD_VERDICTS = (Verdict.FUSED, Verdict.WEIGHED_DOWN, Verdict.DUPLICATE, Verdict.DISABLED)
-"""Verdicts that are no fault of the measurement."""
+from eskf_ros.replay import words
 
 IMU_SILENCE = 1.0
 """s; after this time without an IMU message nothing is published that a robot could navigate by."""
-
-SIGNALS = (Stream.PSEUDORANGE, Stream.RANGE_RATE)
-"""Streams whose sources are signals of satellites."""
 
 
 def set_header(header: Any, stamp: int, frame: str) -> None:
@@ -82,28 +75,23 @@ def quality_message(row: np.void, node: str, silence: float) -> DiagnosticStatus
 
     ``silence``: time since the last IMU message (s), NaN before the first one.
     """
-    quality = Quality(int(row["quality"]))
-    reason = QUALITY_REASONS[quality]
-    is_usable = quality in IS_USABLE
+    words_of_row = words.quality(row, node)
+    status = status_message(words_of_row)
     if not silence <= IMU_SILENCE:
-        is_usable, reason = False, "no IMU message has come" + (f" for {silence:.1f} s" if silence > 0.0 else "")
-    level = DiagnosticStatus.OK if quality == Quality.GOOD else DiagnosticStatus.WARN
-    covariance = row["pose_covariance"]
+        status.level = DiagnosticStatus.ERROR
+        status.message = "no IMU message has come" + (f" for {silence:.1f} s" if silence > 0.0 else "")
+        status.values[0].value = "no"
+    return status
+
+
+def status_message(status: words.Status) -> DiagnosticStatus:
+    """Return a status as a message."""
     return DiagnosticStatus(
-        level=level if is_usable else DiagnosticStatus.ERROR,
-        name=f"{node}: quality",
+        level=bytes([status.level]),
+        name=status.name,
         hardware_id="eskf_ros",
-        message=reason,
-        values=key_values(
-            {
-                "usable": "yes" if is_usable else "no",
-                "quality": quality.name,
-                "state": Status(int(row["status"])).name,
-                "stamp": f"{int(row['stamp']) // SECOND}.{int(row['stamp']) % SECOND:09d}",
-                "horizontal std (m)": f"{math.sqrt(max(0.0, covariance[0, 0] + covariance[1, 1])):.3f}",
-                "heading std (deg)": f"{math.degrees(math.sqrt(max(0.0, covariance[5, 5]))):.2f}",
-            }
-        ),
+        message=status.message,
+        values=key_values(dict(status.values)),
     )
 
 
@@ -111,24 +99,5 @@ def record_statuses(records: np.ndarray, stamp: Time) -> DiagnosticArray:
     """Return one status per measurement: its verdict, and its receiver (0: the first) or signal."""
     message = DiagnosticArray()
     message.header.stamp = stamp
-    for record in records:
-        verdict = Verdict(int(record["verdict"]))
-        good = verdict in GOOD_VERDICTS
-        stream, source = int(record["stream"]), int(record["source"])
-        message.status.append(
-            DiagnosticStatus(
-                level=DiagnosticStatus.OK if good else DiagnosticStatus.WARN,
-                name=STREAM_NAMES[stream],
-                message=verdict.name.lower(),
-                values=key_values(
-                    {
-                        **({"signal": name_of(source)} if stream in SIGNALS else {"receiver": source}),
-                        "stamp": f"{int(record['stamp']) // SECOND}.{int(record['stamp']) % SECOND:09d}",
-                        "nis": float(record["nis"]),
-                        "dof": int(record["dof"]),
-                        "innovation": " ".join(f"{value:.4f}" for value in record["innovation"]),
-                    }
-                ),
-            )
-        )
+    message.status = [status_message(words.verdict(record)) for record in records]
     return message

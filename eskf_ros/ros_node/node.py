@@ -62,13 +62,13 @@ class EskfNode(Node):
     A message that cannot be used is counted and named in the diagnostics; it never ends the node.
     """
 
-    def __init__(self, context: Context | None = None) -> None:
-        """Open all that the node needs.
+    def __init__(self, context: Context | None = None, profile: str = "") -> None:
+        """Open all that the node needs; ``profile`` names the one whose parameters are below those that are given.
 
         Over 60 lines: everything that a node opens, in the order that ROS needs.
         """
         super().__init__("eskf_node", context=context)
-        self.parameters = declare(self)
+        self.parameters = declare(self, profile=profile)
         self.navigator = Navigator(self.parameters)
         self.trouble = Trouble(self.get_logger().error)
         self.verdicts: dict[tuple[int, Verdict], int] = {}

@@ -77,8 +77,8 @@ def replayed(drive, patient, tmp_path_factory) -> tuple[dict[str, Any], np.void]
     words = [str(folder / "bag"), "--config", str(patient), "--out", str(folder), "--output-rate", "0", "--quiet"]
     assert replay(words) == 0
     with open_bag([folder / "bag_eskf" / "odometry.mcap"]) as reader:
-        for batch in reader.batches({"odometry/global": "nav_msgs/msg/Odometry"}):
-            last = batch["odometry/global"].messages[-1]
+        for batch in reader.batches({"/odometry/global": "nav_msgs/msg/Odometry"}):
+            last = batch["/odometry/global"].messages[-1]
     return json.loads((folder / "bag_eskf" / "summary.json").read_text()), last
 
 

@@ -35,8 +35,8 @@ FLOORS = (
     ("filter.readout",),
     ("filter.navigator",),
     ("filter.warm_up", "inputs"),
-    ("replay", "simulate"),
-    ("tables", "doctor"),
+    ("replay", "simulate", "migrate"),
+    ("tables", "doctor", "watch"),
     ("api",),
     ("ros_node",),
 )
