@@ -25,7 +25,7 @@ from eskf_ros.parameters.tree import Frames
 from eskf_ros.replay.topics import FIX, ODOMETRY
 from eskf_ros.replay.tum_writer import tum_text
 
-NAMES = ("odometry.mcap", "trajectory.tum", "aids.csv", "summary.json")
+NAMES = ("odometry.mcap", "trajectory.tum", "aids.csv", "details.npz", "summary.json")
 AIDS_HEADER = "stamp,arrival,aid,innovation_0,innovation_1,innovation_2,nis,dof,verdict,source\n"
 FIX_INTERVAL = 1_000_000_000
 """ns; time between two NavSatFix messages in odometry.mcap."""
@@ -110,6 +110,11 @@ class ResultFiles:
         began = time.perf_counter()
         self._files.close()
         self.seconds += time.perf_counter() - began
+
+    @property
+    def details(self) -> Path:
+        """Where details.npz is written, before `write_summary`."""
+        return self._partial / "details.npz"
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """Write summary.json, after `finish`, and rename all files; a NaN in it must have been replaced by None."""
