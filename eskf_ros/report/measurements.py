@@ -72,11 +72,13 @@ def _innovations(name: str, rows: NDArray[Any], gate: NDArray[np.float64], plots
     plot = plots.over_time(f"{name}: innovations", unit)
     length = np.linalg.norm(np.nan_to_num(rows["innovation"]), axis=1)
     refused = ~np.isin(rows["verdict"], USED)
-    chosen = strongest(length, refused, POINTS)
+    chosen = np.union1d(strongest(length, POINTS), np.flatnonzero(refused)[strongest(length[refused], POINTS)])
     with np.errstate(divide="ignore", invalid="ignore"):
         # e' S^-1 e is the NIS: along e the gate lies at sqrt(gate / NIS) times its length.
         bound = (length * np.sqrt(gate / rows["nis"]))[chosen]
-    for sign, label in ((1.0, "gate"), (-1.0, "")):
+    # A length of metres per second and radians per second together means nothing.
+    has_length = "," not in unit or rows["dof"].max() == 1
+    for sign, label in ((1.0, "gate"), (-1.0, "")) if has_length else ():
         plots.points(plot, rows["stamp"][chosen], sign * bound, GREY, label, marker="dash", size=5, line_alpha=0.6)
     for axis in range(int(rows["dof"].max())):
         values = rows["innovation"][chosen, axis]
@@ -105,7 +107,7 @@ def _nis(name: str, rows: NDArray[Any], gate: NDArray[np.float64], plots: Plots)
     for label, mask, color, marker, size in groups:
         group = np.flatnonzero(mask)
         if len(group):
-            chosen = group[strongest(nis[group], np.zeros(len(group), bool), POINTS)]
+            chosen = group[strongest(nis[group], POINTS)]
             plots.points(plot, rows["stamp"][chosen], nis[chosen], color, label, marker=marker, size=size)
     ends = rows["stamp"][[0, -1]]
     dof = int(np.bincount(rows["dof"]).argmax())

@@ -33,9 +33,9 @@ def motion_section(result: Result, plots: Plots) -> Section:
     three("Velocity in map", "m/s", result.velocity, result.velocity_std, ("east", "north", "up"))
     three("Roll and pitch", "deg", result.angles_deg, result.angles_std_deg, ("roll", "pitch"))
     plot = plots.over_time("Yaw (0 east, 90 north)", "deg")
-    plots.curve(
-        plot, stamps, result.angles_deg[:, 2], BLUE, "yaw", band=np.minimum(3.0 * result.angles_std_deg[:, 2], 180.0)
-    )
+    # More than all around is no more than unknown.
+    band = np.minimum(3.0 * result.angles_std_deg[:, 2], 180.0)
+    plots.curve(plot, stamps, result.angles_deg[:, 2], BLUE, "yaw", band=band)
     section.panels.append(Panel(plot))
     plot = plots.over_time("Standard deviation of the attitude", "deg", y_axis_type="log")
     for axis, name in enumerate(("about east", "about north", "about up")):

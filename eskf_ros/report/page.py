@@ -76,8 +76,9 @@ def page(tracks: list[Result | Track]) -> str:
 
 def _name_apart(main: Result, others: list[Track]) -> None:
     """Give results of the same name that of the folder around them, too."""
+    names = [track.name for track in (main, *others)]
     for track in (main, *others):
-        if isinstance(track, Result) and sum(one.name == track.name for one in (main, *others)) > 1:
+        if isinstance(track, Result) and names.count(track.name) > 1:
             track.name = f"{track.folder.resolve().parent.name}/{track.name}"
 
 

@@ -32,8 +32,8 @@ SEQUENCE = (BLUE, RED, GREEN, PURPLE, ORANGE, SKY, BLACK, YELLOW)
 INK, GRID = "#1f2933", "#e4e7eb"
 INTERVALS = 600
 """A curve keeps the extremes of this many intervals: about two to a point of a wide screen."""
-COLUMNS = 4
-"""Names in a row of a legend."""
+LEGEND_WIDTH, LEGEND_GLYPH = 48, 6
+"""Letters in a row of a legend; letters as wide as the sign before a name."""
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif"
 
 
@@ -197,10 +197,11 @@ def style(plot: Any) -> None:
 
 
 def wrap_legend(plot: Any) -> None:
-    """Put the names of a long legend in rows, as many as a phone is wide."""
+    """Put the names of a long legend in columns, as many as a phone is wide."""
     for legend in plot.legend:
-        if len(legend.items) > COLUMNS:
-            legend.ncols = COLUMNS
+        widths = [len(item.label.value) + LEGEND_GLYPH for item in legend.items]
+        if sum(widths) > LEGEND_WIDTH:
+            legend.ncols = max(1, LEGEND_WIDTH // max(widths))
 
 
 def add_hover(plot: Any, renderers: list[Any], tooltips: list[tuple[str, str]]) -> None:

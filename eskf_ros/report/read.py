@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +67,7 @@ class Result(Track):
     angles_std_deg: Array
     aids: NDArray[Any]
     details: dict[str, NDArray[Any]]
-    smoothed: Track | None = None
+    smoothed: Track | None
 
     def table(self, name: str) -> NDArray[Any]:
         """Return a table of details.npz; empty if there is none."""
@@ -108,20 +108,18 @@ def _folder(path: Path) -> Result:
         details = dict(np.load(path / DETAILS)) if (path / DETAILS).is_file() else {}
     except ValueError as error:
         raise ReportError(f"{path}: {error}") from error
-    result = Result(
+    return Result(
         path.resolve().name.removesuffix("_eskf"),
         folder=path,
         summary=summary,
         aids=read_aids(path / AIDS),
         details=details,
+        smoothed=read_tum(path / SMOOTHED, "smoothed") if (path / SMOOTHED).is_file() else None,
         **_odometry(path / ODOMETRY),
     )
-    if (path / SMOOTHED).is_file():
-        result.smoothed = read_tum(path / SMOOTHED, "smoothed")
-    return result
 
 
-def _odometry(path: Path) -> dict[str, Array]:
+def _odometry(path: Path) -> dict[str, Any]:
     """Return the columns of a `Result` that come from odometry/global."""
     parts: dict[str, list[Array]] = {}
     with open_bag([path]) as reader:
@@ -199,5 +197,4 @@ def in_map_of(track: Track, main: Result) -> Track:
         return track
     there, here = MapFrame(tuple(datum)), MapFrame(tuple(wanted))
     ecef = there.to_ecef(track.position)
-    moved = (ecef - here.origin_ecef) @ here.rotation_map_to_ecef
-    return Track(track.name, track.stamp, moved, track.angles_deg)
+    return replace(track, position=(ecef - here.origin_ecef) @ here.rotation_map_to_ecef)

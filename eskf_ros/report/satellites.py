@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from bokeh.models import ColumnDataSource, Range1d
+from bokeh.models import ColumnDataSource
 from numpy.typing import NDArray
 
 from eskf_ros.report.plots import (
@@ -38,6 +38,9 @@ CONSTELLATIONS = {
 """Name and colour by the RINEX letter."""
 SIGNAL_POINTS = 120
 """Intervals of which the extremes of one signal are drawn."""
+
+LONGEST_LINE = 10.0
+"""s; the points of a signal are joined over this time."""
 
 
 def satellite_section(result: Result, plots: Plots) -> Section | None:
@@ -84,19 +87,22 @@ def _by_signal(names: NDArray[np.bytes_]) -> list[tuple[str, NDArray[np.intp], s
 
 
 def _line(plot: Any, plots: Plots, stamps: Any, values: Any, color: str, label: str, name: str) -> None:
+    # A line does not go on through a time without signals.
+    holes = np.flatnonzero(np.diff(stamps) > LONGEST_LINE) + 1
+    stamps, values = np.insert(stamps, holes, stamps[holes]), np.insert(values, holes, np.nan)
     data = {"t": plots.seconds(stamps), "y": values.astype(np.float32), "name": [name] * len(values)}
     drawn = plot.line("t", "y", source=ColumnDataSource(data), line_color=color, line_alpha=0.7, legend_label=label)
     add_hover(plot, [drawn], [("", "@name"), ("t", "@t{0.0} s"), ("value", "@y{0.0}")])
 
 
 def _sky(signals: NDArray[Any], plots: Plots) -> Any:
-    plot = plain("Sky", "", "", 300, match_aspect=True, x_range=Range1d(-1.15, 1.15), y_range=Range1d(-1.12, 1.12))
+    plot = plain("Sky", "", "", 300, match_aspect=True)
     plot.axis.visible = False
     plot.grid.visible = False
     for elevation in (0, 30, 60):
-        radius = (90 - elevation) / 90
-        plot.ellipse(0, 0, 2 * radius, 2 * radius, fill_color=None, line_color="#c4cad1")
-        plot.text([0.01], [radius - 0.07], [f"{elevation}°"], text_font_size="10px", text_color="#7b8794")
+        ring = (90 - elevation) / 90
+        plot.ellipse(0, 0, 2 * ring, 2 * ring, fill_color=None, line_color="#c4cad1")
+        plot.text([0.01], [ring - 0.07], [f"{elevation}°"], text_font_size="10px", text_color="#7b8794")
     for letter, angle in (("N", 90), ("E", 0), ("S", 270), ("W", 180)):
         x, y = 1.07 * np.cos(np.radians(angle)), 1.07 * np.sin(np.radians(angle))
         plot.text([x], [y], [letter], text_align="center", text_baseline="middle", text_font_size="11px")
@@ -128,7 +134,7 @@ def _residuals(rows: NDArray[Any], title: str, unit: str, plots: Plots) -> Any:
     refused = ~np.isin(rows["verdict"], (b"fused", b"weighed_down"))
     values = rows["innovation"][:, 0]
     for name, group, label, color in _by_signal(rows["source"]):
-        chosen = group[strongest(values[group], np.zeros(len(group), bool), SIGNAL_POINTS)]
+        chosen = group[strongest(np.abs(values[group]), SIGNAL_POINTS)]
         data = {
             "t": plots.seconds(rows["stamp"][chosen]),
             "y": values[chosen].astype(np.float32),
@@ -140,6 +146,6 @@ def _residuals(rows: NDArray[Any], title: str, unit: str, plots: Plots) -> Any:
         add_hover(plot, [drawn], [("", "@name"), ("t", "@t{0.0} s"), ("residual", "@y{0.00}")])
     bad = np.flatnonzero(refused)
     if len(bad):
-        chosen = bad[strongest(values[bad], np.zeros(len(bad), bool), 400)]
+        chosen = bad[strongest(np.abs(values[bad]), 400)]
         plots.points(plot, rows["stamp"][chosen], values[chosen], BLACK, "refused", marker="x", size=7)
     return plot

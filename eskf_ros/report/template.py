@@ -4,6 +4,7 @@ STYLE = """
 :root { --ink: #1f2933; --soft: #52606d; --line: #e4e7eb; --back: #f5f7fa; --good: #009E73; --caution: #E69F00;
   --bad: #D55E00; }
 * { box-sizing: border-box; }
+html, body { overflow-x: clip; }
 body { margin: 0; background: var(--back); color: var(--ink);
   font: 15px/1.45 system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif; }
 header, .summary, section, .mapcard { background: #fff; border: 1px solid var(--line); border-radius: 10px;
@@ -45,7 +46,8 @@ main { display: grid; grid-template-columns: minmax(0, 1fr); } main > div { min-
 .player output { flex-basis: 100%; font-size: 13px; color: var(--soft); font-variant-numeric: tabular-nums;
   min-height: 1.5em; }
 .panels { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 430px), 1fr)); gap: 14px 18px; }
-figure { margin: 0; min-width: 0; } section { scroll-margin-top: 52px; min-width: 0; } figure.wide { grid-column: 1 / -1; }
+figure { margin: 0; min-width: 0; } section { scroll-margin-top: 52px; min-width: 0; }
+figure.wide { grid-column: 1 / -1; }
 figcaption { font-size: 12.5px; color: var(--soft); padding: 2px 8px; }
 footer { color: var(--soft); font-size: 13px; padding: 4px 32px 24px; }
 @media (min-width: 1200px) {

@@ -26,8 +26,14 @@ def extremes(columns: list[NDArray[np.float64]], intervals: int) -> NDArray[np.i
     return np.unique(np.minimum(np.concatenate(chosen), count - 1))
 
 
-def strongest(size: NDArray[np.float64], keep: NDArray[np.bool_], intervals: int) -> NDArray[np.intp]:
-    """Return indices of points (n,): all in `keep` (thinned like the rest if they are many), and extremes of `size`."""
-    kept, rest = np.flatnonzero(keep), np.flatnonzero(~keep)
-    parts = [part[extremes([size[part]], intervals)] for part in (kept, rest) if len(part)]
-    return np.unique(np.concatenate(parts)) if parts else kept
+def strongest(size: NDArray[np.float64], intervals: int) -> NDArray[np.intp]:
+    """Return increasing indices of points (n,): of each interval the largest `size`, and one that is like any other."""
+    count = len(size)
+    per_interval = -(-count // intervals) if count else 1
+    if per_interval <= 2:
+        return np.arange(count)
+    starts = np.arange(0, count, per_interval)
+    padded = np.full(len(starts) * per_interval, -np.inf)
+    padded[:count] = np.where(np.isfinite(size), size, -np.inf)
+    largest = starts + np.argmax(padded.reshape(-1, per_interval), axis=1)
+    return np.unique(np.minimum(np.concatenate([starts, largest]), count - 1))

@@ -23,7 +23,7 @@ def timing_section(result: Result, plots: Plots) -> Section:
         delay = 1e3 * (rows["arrival"] - rows["stamp"])
         if not len(rows) or not (rows["arrival"] > 0).any():
             continue
-        chosen = strongest(delay, np.zeros(len(rows), bool), 400)
+        chosen = strongest(delay, 400)
         plots.points(plot, rows["stamp"][chosen], delay[chosen], color, name, size=3, line_alpha=0.0)
         lines.append((name, *np.percentile(delay, [50.0, 95.0]), delay.max()))
     imu = result.table("imu")
