@@ -21,7 +21,7 @@ def compare_section(main: Result, others: list[Track], plots: Plots) -> Section 
     everything: list[Track] = [main, *others]
     apart = plots.over_time(f"Horizontal distance to {main.name}", "m", y_axis_type="log")
     errors = plots.over_time("Horizontal error against truth", "m", y_axis_type="log")
-    sigmas = plots.over_time("Horizontal standard deviation, as each claims it", "m", y_axis_type="log")
+    sigmas = plots.over_time("Horizontal sigma as claimed", "m", y_axis_type="log")
     truth = main.table("errors")
     lines, without = [], []
     for track, color in zip(everything, (BLUE, *SEQUENCE[1:])):

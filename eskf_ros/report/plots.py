@@ -158,7 +158,8 @@ def plain(title: str, x_label: str, y_label: str, height: int = 230, **options: 
 
 
 def style(plot: Any) -> None:
-    """Give a figure the look of the page."""
+    """Give a figure the look of the page; dragging zooms."""
+    plot.toolbar.active_drag = plot.select_one(BoxZoomTool)
     plot.toolbar.logo = None
     plot.toolbar.autohide = True
     plot.toolbar_location = "above"

@@ -32,7 +32,7 @@ table { border-collapse: collapse; font-size: 13px; font-variant-numeric: tabula
 th, td { padding: 4px 12px 4px 0; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
 th { color: var(--soft); font-weight: 600; } th:first-child, td:first-child { text-align: left; }
 th:last-child, td:last-child { padding-right: 0; }
-.summary td:last-child, .summary th:last-child { text-align: left; white-space: normal; }
+.summary td:last-child, .summary th:last-child { text-align: left; white-space: normal; min-width: 13em; }
 .note { font-size: 13px; margin: 2px 0; } .bad-note, p.bad { color: var(--bad); }
 nav { position: sticky; top: 0; z-index: 20; background: var(--back); padding: 8px 12px;
   border-bottom: 1px solid var(--line); overflow-x: auto; white-space: nowrap; }
@@ -63,7 +63,7 @@ footer { color: var(--soft); font-size: 13px; padding: 4px 32px 24px; }
   @page { size: A4; margin: 12mm; }
   body { background: #fff; font-size: 11px; } nav, .player, #motion, #measurements, #timing { display: none; }
   header, .summary, section, .mapcard { border: 0; margin: 0; padding: 4px 0; }
-  main { display: block; } .mapcard { position: static; } .mapcard .plot { height: 110mm; }
+  main { display: block; } .mapcard { position: static; break-inside: avoid; } .mapcard .plot { height: 110mm; }
   .panels { display: block; columns: 2; column-gap: 6mm; } figure { break-inside: avoid; } h2 { break-after: avoid; }
   .verdict, .sign, .tiles div { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
 }
@@ -87,7 +87,8 @@ SCRIPT = """
     return [low, high, span > 0 ? Math.min(1, Math.max(0, (t - times[low]) / span)) : 0];
   }
   function isSeen(plot) {
-    const box = plot.holder.getBoundingClientRect();
+    // The holder itself has no box (display: contents).
+    const box = plot.holder.firstElementChild.getBoundingClientRect();
     return box.bottom > 0 && box.top < window.innerHeight;
   }
   function draw() {

@@ -45,10 +45,10 @@ function look() {
     const plot = page.get_model_by_id(holder.dataset.rootId);
     found.panels += 1;
     const points = plot.renderers.map(one => one.data_source.get_length() || 0);
-    if (!points.length || Math.max(...points) === 0 || holder.getBoundingClientRect().height < 50)
+    if (!points.length || Math.max(...points) === 0 || holder.firstElementChild.getBoundingClientRect().height < 50)
       found.empty.push(plot.title.text);
   }
-  // Zoom is common to all plots, a click on a name hides its curve, the pointer moves the mark on the map.
+  // Zoom is common to all plots, a click on a name hides its curve, the time moves the mark and the cursors in sight.
   const plots = [...document.querySelectorAll('[data-root-id]')].map(h => page.get_model_by_id(h.dataset.rootId));
   const timed = plots.filter(plot => plot.x_range.name === 'time');
   timed[0].x_range.start = 50;
@@ -58,6 +58,8 @@ function look() {
   window.eskfReport.goTo(100);
   setTimeout(() => {
     found.moved = Math.abs(marker.data.x[0] - before);
+    const spans = timed.flatMap(plot => plot.center).filter(one => one.name === 'cursor');
+    found.cursors = spans.filter(one => one.location === 100).length;
     found.text = document.getElementById('now').textContent;
     document.title = 'FOUND' + JSON.stringify(found);
   }, 500);
@@ -245,4 +247,5 @@ def test_zoom_legends_and_the_common_cursor_work(seen: dict[str, Any]) -> None:
     assert seen["zoomed"]
     assert set(seen["legends"]) == {"hide"}
     assert seen["moved"] > 100.0
+    assert 1 <= seen["cursors"] <= 10  # only those in sight are drawn
     assert seen["text"].startswith("100.0 s")
