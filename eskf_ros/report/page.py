@@ -63,6 +63,7 @@ def page(tracks: list[Result | Track]) -> str:
         bokeh=resources.render_js() if figures else "",
         heading=_heading(main),
         verdict=_verdict(verdict),
+        findings=f"<ul class='findings'>{''.join(map(_finding, verdict.findings))}</ul>",
         tiles=_tiles(main),
         aids=_aids(main.summary),
         notes=_notes(main),
@@ -98,10 +99,9 @@ def _duration(seconds: float) -> str:
 
 
 def _verdict(verdict: Verdict) -> str:
-    items = "".join(_finding(finding) for finding in verdict.findings)
     return (
         f"<div class='verdict {verdict.level}'><span class='sign'>{SIGNS[verdict.level]}</span>"
-        f"<strong>{escape(verdict.headline)}</strong></div><ul class='findings'>{items}</ul>"
+        f"<strong>{escape(verdict.headline)}</strong></div>"
     )
 
 

@@ -24,15 +24,15 @@ header p, p { color: var(--soft); margin: 4px 0 10px; max-width: 80em; } header 
 .findings { list-style: none; margin: 12px 0; padding: 0; }
 .findings li { display: flex; gap: 10px; padding: 5px 0; } .findings .sign { font-size: 12px; margin-top: 3px; }
 .findings em { color: var(--soft); }
-.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(130px, 1fr)); gap: 10px; margin: 12px 0; }
+.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(140px, 1fr)); gap: 10px; margin: 12px 0; }
 .tiles div { background: var(--back); border-radius: 8px; padding: 10px 12px; }
 .tiles b { display: block; font-size: 22px; font-weight: 650; } .tiles span { color: var(--soft); font-size: 13px; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-size: 13px; font-variant-numeric: tabular-nums; margin: 4px 0 10px; }
-th, td { padding: 4px 12px 4px 0; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
+th, td { padding: 4px 9px 4px 0; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
 th { color: var(--soft); font-weight: 600; } th:first-child, td:first-child { text-align: left; }
 th:last-child, td:last-child { padding-right: 0; }
-.summary td:last-child, .summary th:last-child { text-align: left; white-space: normal; min-width: 13em; }
+.summary td:last-child, .summary th:last-child { text-align: left; white-space: normal; }
 .note { font-size: 13px; margin: 2px 0; } .bad-note, p.bad { color: var(--bad); }
 nav { position: sticky; top: 0; z-index: 20; background: var(--back); padding: 8px 12px;
   border-bottom: 1px solid var(--line); overflow-x: auto; white-space: nowrap; }
@@ -45,16 +45,19 @@ main { display: grid; grid-template-columns: minmax(0, 1fr); } main > div { min-
   font-size: 14px; cursor: pointer; } .player input { flex: 1; min-width: 120px; accent-color: #0072B2; }
 .player output { flex-basis: 100%; font-size: 13px; color: var(--soft); font-variant-numeric: tabular-nums;
   min-height: 1.5em; }
-.panels { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 430px), 1fr)); gap: 14px 18px; }
+.panels { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 360px), 1fr)); gap: 14px 18px; }
 figure { margin: 0; min-width: 0; } section { scroll-margin-top: 52px; min-width: 0; }
 figure.wide { grid-column: 1 / -1; }
 figcaption { font-size: 12.5px; color: var(--soft); padding: 2px 8px; }
 footer { color: var(--soft); font-size: 13px; padding: 4px 32px 24px; }
 @media (min-width: 1200px) {
+  .tiles { grid-template-columns: repeat(3, 1fr); }
+  .two { display: grid; grid-template-columns: minmax(0, 1fr) minmax(0, 1fr); gap: 32px; margin-top: 12px; }
   main { grid-template-columns: minmax(0, 2fr) minmax(0, 3fr); align-items: start; }
   .mapcard { position: sticky; top: 52px; margin-right: 0; } .mapcard .plot { height: min(calc(100vh - 200px), 44vw); }
 }
 @media (max-width: 600px) {
+  .summary td:last-child { min-width: 13em; }
   header, .summary, section, .mapcard { margin: 8px 6px; padding: 12px 10px; }
   .verdict { font-size: 17px; padding: 10px 12px; } .mapcard .plot { height: 105vw; } footer { padding: 4px 16px 20px; }
   .tiles { grid-template-columns: 1fr 1fr; }
@@ -166,10 +169,12 @@ PAGE = """<!DOCTYPE html>
 <header>{heading}</header>
 <div class="summary">
 {verdict}
-<div class="tiles">{tiles}</div>
-<h2>What became of the measurements</h2>
+<div class="two">
+<div>{findings}<div class="tiles">{tiles}</div></div>
+<div><h2>What became of the measurements</h2>
 {aids}
-{notes}
+{notes}</div>
+</div>
 </div>
 <nav>{navigation}</nav>
 <main>
