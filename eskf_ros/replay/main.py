@@ -269,11 +269,12 @@ def _replay(bag: Path, folder: Path, parameters: Parameters, options: argparse.N
 def _report(folder: Path) -> Path:
     """Make the page of a result and return where it is; raises _Mistake."""
     from eskf_ros.report.main import NAME, write_report
+    from eskf_ros.report.read import ReportError
 
     try:
         write_report([folder], folder / NAME)
-    except OSError as error:
-        raise _Mistake(f"{error.filename or folder}: {error.strerror or error}") from error
+    except ReportError as error:
+        raise _Mistake(str(error)) from error
     return folder / NAME
 
 

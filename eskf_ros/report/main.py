@@ -24,11 +24,15 @@ def is_available() -> bool:
 
 
 def write_report(results: Sequence[Path], target: Path) -> None:
-    """Write the page on these results. Raises ReportError, OSError."""
+    """Write the page on these results. Raises ReportError."""
     from eskf_ros.report.page import page
-    from eskf_ros.report.read import read_result
+    from eskf_ros.report.read import ReportError, read_result
 
-    target.write_text(page([read_result(path) for path in results]), encoding="utf-8")
+    text = page([read_result(path) for path in results])
+    try:
+        target.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ReportError(f"{error.filename or target}: {error.strerror or error}") from error
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -52,8 +56,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         write_report(options.results, target)
     except ReportError as error:
         return _say(str(error))
-    except OSError as error:
-        return _say(f"{error.filename or target}: {error.strerror or error}")
     except KeyboardInterrupt:
         print("eskf_report: interrupted, nothing written", file=sys.stderr)
         return 130

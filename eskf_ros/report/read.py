@@ -16,6 +16,7 @@ from eskf_ros.geodesy.map_frame import MapFrame
 Array = NDArray[np.float64]
 
 SUMMARY, ODOMETRY, AIDS, DETAILS = "summary.json", "odometry.mcap", "aids.csv", "details.npz"
+TRAJECTORY = "trajectory.tum"
 SMOOTHED = "trajectory_smoothed.tum"
 ODOMETRY_TOPIC = {"odometry/global": "nav_msgs/msg/Odometry"}
 BLOCK = 1 << 23
@@ -100,7 +101,7 @@ def read_tum(path: Path, name: str) -> Track:
 
 
 def _folder(path: Path) -> Result:
-    missing = [name for name in (SUMMARY, ODOMETRY, AIDS) if not (path / name).is_file()]
+    missing = [name for name in (SUMMARY, ODOMETRY, AIDS, TRAJECTORY) if not (path / name).is_file()]
     if missing:
         raise ReportError(f"{path}: not the folder of a replay, {', '.join(missing)} missing")
     try:
@@ -120,7 +121,9 @@ def _folder(path: Path) -> Result:
 
 
 def _odometry(path: Path) -> dict[str, Any]:
-    """Return the columns of a `Result` that come from odometry/global."""
+    """Return the columns of a `Result` that come from odometry/global; empty ones if no position was ever known."""
+    if not (path.parent / TRAJECTORY).stat().st_size:
+        return _columns(None)
     parts: dict[str, list[Array]] = {}
     with open_bag([path]) as reader:
         for batch in reader.batches(ODOMETRY_TOPIC):

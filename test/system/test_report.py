@@ -54,16 +54,20 @@ function look() {
   timed[0].x_range.start = 50;
   found.zoomed = timed.every(plot => plot.x_range.start === 50);
   found.legends = plots.flatMap(plot => plot.above).filter(one => one.click_policy).map(one => one.click_policy);
-  const marker = page.get_model_by_name('marker'), before = marker.data.x[0];
-  window.eskfReport.goTo(100);
-  setTimeout(() => {
-    found.moved = Math.abs(marker.data.x[0] - before);
+  const marker = page.get_model_by_name('marker'), now = document.getElementById('now');
+  let before = null, tries = 0;
+  function check() {
+    tries += 1;
+    if (before === null && now.textContent) { before = marker.data.x[0]; window.eskfReport.goTo(100); }
+    if (!now.textContent.startsWith('100.0 s') && tries < 100) { setTimeout(check, 100); return; }
     const spans = timed.flatMap(plot => plot.center).filter(one => one.name === 'cursor');
+    found.moved = Math.abs(marker.data.x[0] - before);
     found.timed = timed.length;
     found.cursors = spans.filter(one => one.location === 100).length;
-    found.text = document.getElementById('now').textContent;
+    found.text = now.textContent;
     document.title = 'FOUND' + JSON.stringify(found);
-  }, 500);
+  }
+  check();
 }
 look();
 </script>
@@ -183,6 +187,15 @@ def test_a_smoothed_trajectory_in_the_folder_is_shown(folder: Path, tmp_path: Pa
     shutil.copy(copy / "trajectory.tum", copy / "trajectory_smoothed.tum")
     assert report([str(copy)]) == 0
     assert "<td>smoothed</td>" in (copy / "report.html").read_text(encoding="utf-8")
+
+
+def test_without_a_position_the_page_says_so(tmp_path: Path) -> None:
+    options = ["--config", str(CONFIG), "--out", str(tmp_path), "--quiet", "--report", "--outage", "0:1000"]
+    assert replay([str(BAG), *options]) == 0
+    text = (tmp_path / "tunnel_drive_eskf" / "report.html").read_text(encoding="utf-8")
+    assert "Do not navigate by this result yet." in text
+    assert "No position was found." in text
+    assert "There is no track" in text
 
 
 def test_mistakes_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
