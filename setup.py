@@ -81,7 +81,10 @@ setup(
         ],
         # The World Magnetic Model, for the declination that a magnetometer needs; MIT, 0.3 MB, without dependencies.
         "mag": ["pygeomag"],
+        # The page of eskf_report, on the computer where results are looked at: BSD, draws without a network.
+        "report": ["bokeh>=3.4"],
         "test": [
+            "bokeh>=3.4",
             "gtsam",
             "hypothesis",
             "matplotlib",  # examples/compare_configurations.py draws a plot
@@ -101,6 +104,7 @@ setup(
         "console_scripts": [
             "eskf_node = eskf_ros.ros_node.main:main",
             "eskf_replay = eskf_ros.replay.main:main",
+            "eskf_report = eskf_ros.report.main:main",
             "eskf_check = eskf_ros.doctor.main:main",
             "eskf_ranges = eskf_ros.inputs.ranges_command:main",
             "eskf_simulate = eskf_ros.simulate.main:main",

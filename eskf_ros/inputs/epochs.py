@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -111,6 +111,7 @@ class RangeIntake:
         refused: messages and parts of them that could not be used, by reason.
         notes: what was left out of the files of ``ranges.rinex_nav_files``.
         wants_solution: make a point solution of every epoch, in mode tight, too.
+        watch: called with the stamp (ns) and the signals (MEASURED_SIGNAL or RANGE) of each epoch, if given.
     """
 
     def __init__(self, navigator: Navigator, parameters: Parameters) -> None:
@@ -136,6 +137,7 @@ class RangeIntake:
         self._recently_refused: deque[Counter[str]] = deque(maxlen=RECENT)
         self._recent_statuses: deque[Counter[Status]] = deque(maxlen=RECENT)
         self.wants_solution = False
+        self.watch: Callable[[int, NDArray[Any]], None] | None = None
 
     def configure(self, parameters: Parameters) -> None:
         """Use other masks and offsets from now on: those that can change while the node runs."""
@@ -182,6 +184,8 @@ class RangeIntake:
         ephemerides, klobuchar = self._serving(stamp + self._time_offset, (epoch.week, epoch.seconds))
         if self._solves:
             solution = self._solution(epoch, ephemerides, klobuchar)
+            if self.watch is not None:
+                self.watch(stamp, epoch.ranges)
             statuses = status_counts(epoch.ranges)
             self._recent_statuses.append(statuses)
             self._navigator.range_statuses.update(statuses)
@@ -189,6 +193,8 @@ class RangeIntake:
             return solution
         instant = (epoch.week, epoch.seconds)
         signals = measured_epoch(epoch.ranges, *instant, ephemerides, masks=self._masks)
+        if self.watch is not None:
+            self.watch(stamp, signals)
         self._recent_statuses.append(status_counts(signals))
         wants_place = self._navigator.needs_field and stamp % PLACE_INTERVAL < PLACE_SHARE
         if not (self.wants_solution or wants_place):

@@ -29,7 +29,9 @@ results, in DIR/<bag name>_eskf/ (files of an earlier replay are replaced):
   odometry.mcap   odometry, fixes, verdicts, biases, diagnostics, path and truth, for Foxglove and others
   trajectory.tum  t x y z qx qy qz qw: base_link in map as it was published at that time, from the first known position
   aids.csv        one line per GNSS message or signal: stamp, arrival, aid, innovation, NIS, degrees of freedom, verdict
+  details.npz     what only a report needs: biases, states, errors, fixes and the IMU by the second
   summary.json    everything in numbers
+  report.html     with --report: all of it as a page for a browser (eskf_report makes one of several results)
 
 A rosbag2 directory is one recording; several arguments are replayed one after the other.
 ROS 1 bags: `rosbags-convert --src IN.bag --dst OUT` makes a ROS 2 bag of one.
@@ -167,6 +169,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--json", metavar="FILE", help="write the summary here too; - is stdout, tables go to stderr then"
     )
+    parser.add_argument("--report", action="store_true", help="make report.html, too (needs the package bokeh)")
     parser.add_argument("--quiet", action="store_true", help="no progress and no table; warnings and errors only")
     return parser
 
@@ -199,6 +202,11 @@ def _run(options: argparse.Namespace) -> int:
     from eskf_ros.parameters.ros_yaml import load
     from eskf_ros.parameters.schema import ParameterError
 
+    if options.report:
+        from eskf_ros.report.main import MISSING, is_available
+
+        if not is_available():
+            raise _Mistake(MISSING)
     folders = [_folder(bag, options.out) for bag in options.bags]
     for folder in folders:
         if folders.count(folder) > 1:
@@ -252,11 +260,24 @@ def _replay(bag: Path, folder: Path, parameters: Parameters, options: argparse.N
         raise _Mistake(str(error)) from error
     except OSError as error:
         raise _Mistake(f"{error.filename or folder}: {error.strerror or error}") from error
+    report = _report(folder) if options.report else None
     if not options.quiet:
-        _show(summary, folder, to_stderr=options.json == "-")
+        _show(summary, folder, report, to_stderr=options.json == "-")
     for warning in summary["warnings"]:
         _say(f"warning: {warning}")
     return summary
+
+
+def _report(folder: Path) -> Path:
+    """Make the page of a result and return where it is; raises _Mistake."""
+    from eskf_ros.report.main import NAME, write_report
+    from eskf_ros.report.read import ReportError
+
+    try:
+        write_report([folder], folder / NAME)
+    except ReportError as error:
+        raise _Mistake(str(error)) from error
+    return folder / NAME
 
 
 @contextmanager
@@ -293,7 +314,7 @@ def _write_json(target: str, content: Any) -> None:
         raise _Mistake(f"--json {target}: {error.strerror or error}") from error
 
 
-def _show(summary: dict[str, Any], folder: Path, to_stderr: bool) -> None:
+def _show(summary: dict[str, Any], folder: Path, report: Path | None, to_stderr: bool) -> None:
     """Print the tables."""
     from rich.console import Console
 
@@ -343,6 +364,8 @@ def _show(summary: dict[str, Any], folder: Path, to_stderr: bool) -> None:
             outages.add_row(f"at {outage['start']:g} s", f"{outage['length']:g}", f"{outage['distance']:.0f}", *at_end)
         console.print(outages)
     console.print(f"Results: {folder}", highlight=False, soft_wrap=True)
+    if report is not None:
+        console.print(f"Report, open it in a browser: {report}", highlight=False, soft_wrap=True)
 
 
 def _rejections(summary: dict[str, Any]) -> list[str]:

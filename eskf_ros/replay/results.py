@@ -27,7 +27,7 @@ from eskf_ros.replay.truth import EPOCH
 from eskf_ros.replay.tum_writer import tum_text
 from eskf_ros.replay.views import Views, first_in_each
 
-NAMES = ("odometry.mcap", "trajectory.tum", "aids.csv", "summary.json")
+NAMES = ("odometry.mcap", "trajectory.tum", "aids.csv", "details.npz", "summary.json")
 AIDS_HEADER = "stamp,arrival,aid,innovation_0,innovation_1,innovation_2,nis,dof,verdict,source\n"
 FIX_INTERVAL = 1_000_000_000
 """ns; time between two NavSatFix messages in odometry.mcap."""
@@ -141,6 +141,11 @@ class ResultFiles:
         self._views.finish()
         self._files.close()
         self.seconds += time.perf_counter() - began
+
+    @property
+    def details(self) -> Path:
+        """Where details.npz is written, before `write_summary`."""
+        return self._partial / "details.npz"
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """Write summary.json, after `finish`, and rename all files; a NaN in it must have been replaced by None."""

@@ -21,6 +21,7 @@ from eskf_ros.inputs.epochs import RangeIntake
 from eskf_ros.inputs.rinex_as_messages import RangesError, merged, read_beside
 from eskf_ros.inputs.table import FIX
 from eskf_ros.parameters.tree import Parameters
+from eskf_ros.replay.details import Details
 from eskf_ros.replay.feed import Feed
 from eskf_ros.replay.results import ResultFiles, selected
 from eskf_ros.replay.summary import Summary, ranges_result, truth_result
@@ -97,6 +98,9 @@ def replay(
         feed = Feed(navigator, topics, options.order, options.outages, options.mode == "ins-only", intake)
         truth = TruthComparison(parameters.gnss.lever_arm if topics.truth_type == FIX else (0.0, 0.0, 0.0))
         summary = Summary(feed, options.outages)
+        details = Details(topics, parameters)
+        if intake is not None:
+            intake.watch = details.watch_signals
 
         thinning = options.output_rate if thinned else 0.0
         with ResultFiles(options.folder, parameters.frames, thinning, bool(topics.truth)) as files:
@@ -106,6 +110,7 @@ def replay(
                 if len(known) and topics.truth and datum:
                     truth.add_rows(known, datum)
                 summary.add(known, records)
+                details.add_rows(rows)
                 clock.lap("compare")
                 files.write(rows, records, datum, *beside)
                 clock.lap("wait")
@@ -113,6 +118,8 @@ def replay(
             clock.lap("start")
             for batch in feed.ordered(messages):
                 clock.lap("read")
+                details.add_batch(batch)
+                clock.lap("details")
                 rows = feed.push(batch)
                 clock.lap("filter")
                 epochs = to_epochs(batch[topics.truth]) if topics.truth in batch else None
@@ -125,6 +132,8 @@ def replay(
             files.finish()
             clock.lap("wait")
             compared = truth.compared() if topics.truth else None
+            details.save(files.details, navigator, feed.first_stamp, compared)
+            clock.lap("details")
             result = {
                 "bag": str(bag),
                 "mode": options.mode or parameters.mode,

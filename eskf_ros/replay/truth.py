@@ -45,9 +45,18 @@ COMPARED = np.dtype(
         ("heading_deg", "f8"),
         ("nees_position", "f8"),
         ("nees_attitude", "f8"),
+        ("error_enu", "f8", (3,)),
+        ("std_enu", "f8", (3,)),
+        ("attitude_error_deg", "f8", (3,)),
+        ("attitude_std_deg", "f8", (3,)),
+        ("truth_map", "f8", (3,)),
     ]
 )
-"""One compared epoch: absolute errors (m, m, m/s, deg) and NEES; NaN if truth or estimate has no such value."""
+"""One compared epoch: absolute errors (m, m, m/s, deg) and NEES; NaN if truth or estimate has no such value.
+
+With signs, estimate minus truth, and the standard deviations they are judged by: ``error_enu`` (m) East-North-Up,
+``attitude_error_deg`` about the map axes. ``truth_map``: the truth in `map` (m), of base_link or of the antenna.
+"""
 
 
 def epochs_from_odometry(messages: NDArray[Any], map_frame: MapFrame | None) -> NDArray[Any]:
@@ -180,7 +189,14 @@ def compare(
     compared["heading_deg"] = np.abs(np.degrees(np.arctan2(np.sin(heading_error), np.cos(heading_error))))
     compared["nees_position"] = _normalised_squares(error_ecef @ rotation_map_to_ecef, position_covariance)
     compared["nees_attitude"] = _normalised_squares(attitude_error, covariance[:, 3:, 3:])
+    local_covariance = local_to_map.transpose(0, 2, 1) @ position_covariance @ local_to_map
+    compared["error_enu"] = error_local
+    compared["std_enu"] = np.sqrt(np.diagonal(local_covariance, axis1=1, axis2=2))
+    compared["attitude_error_deg"] = -np.degrees(attitude_error)
+    compared["attitude_std_deg"] = np.degrees(np.sqrt(np.diagonal(covariance[:, 3:, 3:], axis1=1, axis2=2)))
+    compared["truth_map"] = (epochs["position_ecef"] - map_frame.origin_ecef) @ rotation_map_to_ecef
     compared["heading_deg"][~heading_known] = np.nan
+    compared["attitude_error_deg"][~heading_known, 2] = np.nan
     compared["nees_attitude"][~heading_known] = np.nan
     return compared
 

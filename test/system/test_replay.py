@@ -44,7 +44,7 @@ TYPES = {
     "gps/vel": "geometry_msgs/msg/TwistWithCovarianceStamped",
     "truth": "nav_msgs/msg/Odometry",
 }
-FILES = ["aids.csv", "odometry.mcap", "summary.json", "trajectory.tum"]
+FILES = ["aids.csv", "details.npz", "odometry.mcap", "summary.json", "trajectory.tum"]
 OUTAGE = (80.0, 20.0)
 
 

@@ -35,6 +35,7 @@ FLOORS = (
     ("filter.readout",),
     ("filter.navigator",),
     ("filter.warm_up", "inputs"),
+    ("report",),
     ("replay", "simulate", "migrate"),
     ("tables", "doctor", "watch"),
     ("api",),
@@ -123,6 +124,19 @@ def test_only_the_node_imports_ros() -> None:
         if name and name.split(".")[0] == "rclpy"
     }
     assert importers == {"ros_node"}
+
+
+def test_only_the_replay_asks_for_a_report() -> None:
+    """The robot needs neither the page nor what draws it: not even the replay imports it before it is asked for."""
+    asking = {
+        module_of(source)
+        for source in SOURCES
+        for node in ast.walk(ast.parse(source.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("eskf_ros.report")
+        if not source.is_relative_to(PACKAGE / "report")
+    }
+    assert asking == {"replay.main"}
+    assert "report" not in {room_of(name) for name in imports_of(PACKAGE / "replay" / "main.py")}
 
 
 def root_of(node: ast.expr) -> ast.expr:

@@ -48,15 +48,14 @@ SCATTER = np.dtype(
 """Scatter of the messages of the receivers, by source: mean squares over what the covariances allow.
 
 - ``spread``, ``velocity``: of the innovations of positions and velocities in the humble lane.
-- ``change``, ``pairs``: of the differences of the errors of two consecutive fixes, in which those that last cancel, and the number of pairs.
-- ``recent``: the last two of these mean squares, the older one first.
-- ``walk``: the part of the squares of the changes that the next change does not take back, over the claimed variance, in
-  the filter; ``walk_stamp``, ``walk_residual``, ``last_change``: of the last fix, as below, and its change (m, map).
+- ``change``, ``pairs``: of the differences of the errors of two consecutive fixes, in which those that last cancel, and
+  the number of pairs; ``recent``: the last two of them, the older one first.
+- ``walk``: the part of the squares of the changes that the next change does not take back, over the claimed variance,
+  in the filter; ``walk_stamp``, ``walk_residual``, ``last_change``: of the last fix, as below, and its change (m, map).
 - ``white``, ``lasting``: shares of the claimed variance that are new with each fix, and that last and are estimated.
-- ``calm``: share of the claimed variance that lasts and is followed by the position; ``walking``: share by which it grows
-  from fix to fix.
-- ``share``, ``claimed``: share of the position that comes from the fixes, and the variance they claim (m2; per axis of
-  map).
+- ``calm``: share that lasts and is followed by the position; ``walking``: share by which it grows from fix to fix.
+- ``share``, ``claimed``: share of the position that comes from the fixes, and the variance they claim (m2), by axis of
+  map.
 - ``last_stamp``, ``last_residual``: of the last fix: its stamp (ns), and how far it was from the position of the humble
   lane once this was corrected (m, map).
 """
@@ -108,6 +107,7 @@ STEADY = 2.0
 
 LARGEST_VALUE = 2.0
 """Standard deviations of a lasting error; one that is found to be larger keeps its scale."""
+
 
 @njit
 def copy_scatter(state, lane, source):
@@ -285,7 +285,8 @@ def update_shares(state, lane, source, settings, work):
     unknown there is no such lane, and ``lane`` is the filter.
     """
     scatter = state.scatter
-    if not is_enough(scatter.pairs[source], scatter.change[source]) or settings.position_error_at == NOWHERE or settings.correlated_share > 0.0:
+    is_learned = settings.position_error_at != NOWHERE and settings.correlated_share == 0.0
+    if not is_learned or not is_enough(scatter.pairs[source], scatter.change[source]):
         return
     used = scatter.white[source]
     change, spread = scatter.change[source], scatter.spread[source]
