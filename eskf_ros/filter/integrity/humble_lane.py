@@ -24,10 +24,10 @@ import numpy as np
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import heading_of
 from eskf_ros.filter.integrity.refusal import (
+    IMU_ASTRAY,
     JUMP_GATE,
     OPENED_VELOCITY_STD,
     is_jump,
-    is_other_agreeing,
     is_small,
     kind_of,
     note_jump,
@@ -149,8 +149,8 @@ def linearize(lane, aid, settings, work):
 def hear(states, aid, gate, settings, work):
     """Let the humble lane hear a message.
 
-    Returns whether it jumps, whether it is believed now after many like it were refused, and NIS and log determinant of
-    its innovation.
+    Returns whether it jumps, why it is believed now after many like it were refused (`note_jump`; 0: it is not one of
+    these), and NIS and log determinant of its innovation.
     """
     state, humble = states[FILTER], states[HUMBLE]
     kind, source = kind_of(aid.stream), receiver_of(aid)
@@ -159,22 +159,21 @@ def hear(states, aid, gate, settings, work):
         linearize(humble, aid, settings, work)
     nis, determinant = judge(humble, size, work)
     if determinant == 0.0:
-        return True, False, nis, 0.0
-    believed = False
+        return True, 0, nis, 0.0
+    believed = 0
     if state.trust.refused[kind, source] > 0 or is_jump(nis, kind, work):
         if is_expected(state, aid, gate, settings, work):
             # While it refused, the humble lane has gone astray: it starts anew from the filter.
             state.trust.refused[kind, source] = 0
             humble.heading_known = 0
-            return False, False, nis, math.inf
-        if not note_jump(state, aid, kind, work):
-            return True, False, nis, 0.0
+            return False, 0, nis, math.inf
+        believed = note_jump(state, aid, kind, work)
+        if believed == 0:
+            return True, 0, nis, 0.0
         linearize(humble, aid, settings, work)
-        is_inertial = kind == 1 or not is_other_agreeing(state, aid.stream, source)
-        reset_to_message(humble, state.trust, aid, is_inertial, work)
+        reset_to_message(humble, state.trust, aid, believed == IMU_ASTRAY, work)
         size = linearize(humble, aid, settings, work)
         nis, determinant = judge(humble, size, work)
-        believed = True
     state.trust.refused[kind, source] = 0
     apply(humble, size, work)
     return False, believed, nis, math.log(determinant)

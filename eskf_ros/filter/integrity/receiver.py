@@ -23,7 +23,7 @@ from eskf_ros.filter.integrity.humble_lane import (
     weigh_evidence,
 )
 from eskf_ros.filter.integrity.recovery import note, note_reset
-from eskf_ros.filter.integrity.refusal import JUMP_GATE, kind_of, note_jump
+from eskf_ros.filter.integrity.refusal import IMU_ASTRAY, JUMP_GATE, RECEIVER_STEPPED, kind_of, note_jump
 from eskf_ros.filter.integrity.scatter import (
     copy_scatter,
     follow_calm_error,
@@ -68,7 +68,7 @@ def fuse_receiver(states, aid, gate, settings, work):
     state, humble = states[FILTER], states[HUMBLE]
     start(states, settings)
     heard = is_running(states)
-    jumps, believed, humble_nis, humble_log = False, False, 0.0, 0.0
+    jumps, believed, humble_nis, humble_log = False, 0, 0.0, 0.0
     is_position = aid.stream == Stream.GNSS_POSITION
     if is_position:
         propagate_walk(state, state, aid.source)
@@ -77,14 +77,17 @@ def fuse_receiver(states, aid, gate, settings, work):
             propagate_walk(state, humble, aid.source)
         copy_scatter(state, humble, aid.source)
         jumps, believed, humble_nis, humble_log = hear(states, aid, gate, settings, work)
-        if believed:
+        if believed == IMU_ASTRAY:
             reset_to_humble_lane(states)
+        elif believed == RECEIVER_STEPPED:
+            linearize(state, aid, settings, work)
+            reset_to_message(state, state.trust, aid, False, work)
         if humble.heading_known == 0:
             heard = False
         elif jumps and is_position:
             learn_from_change(state, humble, aid.source, False, settings, work)
             update_shares(state, humble, aid.source, settings, work)
-        elif not jumps:
+        elif not jumps and not believed:
             learn(state, humble, aid, humble_nis, settings, work)
     size = linearize(state, aid, settings, work)
     if is_position:
@@ -104,14 +107,14 @@ def fuse_receiver(states, aid, gate, settings, work):
     elif heard or aid.nis <= JUMP_GATE:
         update_weighed_down(state, size, aid.nis / gate, work)
         aid.verdict = Verdict.WEIGHED_DOWN
-    elif note_jump(state, aid, kind_of(aid.stream), work):
-        reset_to_message(state, state.trust, aid, True, work)
-        linearize(state, aid, settings, work)
-        update(state, size, math.inf, work)
-        believed = True
     else:
         aid.verdict = Verdict.GATE
-    is_fused = believed or aid.verdict in (Verdict.FUSED, Verdict.WEIGHED_DOWN)
+        believed = note_jump(state, aid, kind_of(aid.stream), work)
+        if believed:
+            reset_to_message(state, state.trust, aid, True, work)
+            linearize(state, aid, settings, work)
+            update(state, size, math.inf, work)
+    is_fused = believed != 0 or aid.verdict in (Verdict.FUSED, Verdict.WEIGHED_DOWN)
     if is_fused and is_position:
         follow_calm_error(state, aid.source, work)
         learn_walk(state, aid.source, settings, work)

@@ -25,6 +25,12 @@ AGREEMENT_GATE = 16.27
 FEWEST = 5
 """Refused messages in a row that must agree with each other before they are believed."""
 
+RECEIVER_STEPPED = 1
+"""Why refused messages are believed: the receiver has stepped aside, for good."""
+
+IMU_ASTRAY = 2
+"""Why refused messages are believed: the IMU, or the velocity, is wrong."""
+
 SHORT_PATIENCE = 1_000_000_000
 """ns; position and velocity that both contradict the humble lane are believed after this time: the IMU is wrong."""
 
@@ -82,7 +88,10 @@ def is_small(kind, work):
 
 @njit
 def note_jump(state, aid, kind, work):
-    """Count a message that jumps; say whether those refused have agreed for long enough to be believed.
+    """Count a message that jumps; return whether those refused have agreed for long enough to be believed, and why.
+
+    0: they have not; `RECEIVER_STEPPED`: the offset stayed the same; `IMU_ASTRAY`: it grew, or both kinds of messages of
+    the receiver contradict the IMU.
 
     ``work`` holds its innovation in the filter, and its noise. Offsets that stay the same are those of a
     receiver that has stepped aside; offsets that grow come from an IMU that goes astray, unless the velocities of the
@@ -125,7 +134,9 @@ def note_jump(state, aid, kind, work):
     is_apart = is_alone and stays > AGREEMENT_GATE
     is_apart = is_apart or is_other_refused(state, aid.stream, source) or state.heading_known == 0
     patience = SHORT_PATIENCE if is_apart else patience_for(state, aid.stream, source)
-    return trust.refused[kind, source] >= FEWEST and lasted >= patience
+    if trust.refused[kind, source] < FEWEST or lasted < patience:
+        return 0
+    return IMU_ASTRAY if is_apart or kind == 1 else RECEIVER_STEPPED
 
 
 @njit

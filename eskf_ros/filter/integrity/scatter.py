@@ -102,6 +102,9 @@ LEAST_INTERVAL = 0.05
 LEAST_LASTING = 0.5
 """Least share of a lasting error that is worth the augmented states."""
 
+SHORT_SUPPORT = 5.0
+"""s; a position that fixes have supported for less may be what is wrong when the next fixes are away from it."""
+
 STEADY = 2.0
 """The lasting share follows what is found only when it is off by this factor: it is a scale of augmented states."""
 
@@ -304,7 +307,9 @@ def update_shares(state, lane, source, settings, work):
     if found > STEADY * lasting or found * STEADY < lasting:
         scatter.lasting[source] = found
         if found > 0.0:
-            factor = found / max(used, LEAST_WHITE) if off > 0.0 else 0.0
+            factor = found / max(used, LEAST_WHITE)
+            if off == 0.0:
+                factor *= followed_part(state, source) if lasting == 0.0 else 0.0
             inflate_lasting_error(state, lasting, found, factor, settings, work)
             if state.heading_known == 1:
                 inflate_lasting_error(lane, lasting, found, factor, settings, work)
@@ -315,6 +320,13 @@ def update_shares(state, lane, source, settings, work):
         steps = 1.0 / (settings.optional_decay[settings.position_error_at - ERROR_SIZE] * interval)
         calm = min(0.5 * scatter.walk[source] * steps, LARGEST_SPREAD)
     scatter.calm[source] = calm if scatter.lasting[source] == 0.0 else 0.0
+
+
+@njit
+def followed_part(state, source):
+    """Return the share of a lasting error that the position may have followed, because few fixes have made it so far."""
+    supported = state.stamp - state.streams.fused_since[Stream.GNSS_POSITION.value, source]
+    return min(1.0, (SHORT_SUPPORT / max(supported * 1e-9, 1.0)) ** 2)
 
 
 @njit
@@ -377,9 +389,9 @@ def largest_square(state, place):
 def inflate_lasting_error(state, before, now, factor, settings, work):
     """Change the scale of the lasting error from the share ``before`` to ``now``; the value stays.
 
-    Where it is known to be in the position, too, which has followed it (a wrong lever arm), the position is widened by
-    ``factor`` times the noise in ``work``: the two are the same with opposite signs. An error that is seen because the
-    position has not followed it leaves the position as it is.
+    Where it may be in the position, too, which has followed it (a wrong lever arm), the position is widened by ``factor``
+    times the noise in ``work``: the two are the same with opposite signs. An error that is seen because the position has
+    not followed it leaves the position as it is.
     """
     place = settings.position_error_at
     update_error_size(state, place + 3, settings)
