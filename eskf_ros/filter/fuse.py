@@ -92,7 +92,7 @@ def offer(states, aid, heading_before, settings, work):
     gate = settings.gate[aid.stream, 3]
     is_gnss = aid.stream in (Stream.GNSS_POSITION, Stream.GNSS_VELOCITY)
     if is_gnss:
-        reset_for_new_solution(states, aid, settings)
+        reset_for_new_solution(states, aid, settings, work)
         fuse_receiver(states, aid, gate, settings, work)
         size = aid.dof
     else:

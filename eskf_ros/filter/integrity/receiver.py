@@ -47,7 +47,7 @@ SAME_SOLUTION = 4.0
 
 
 @njit
-def reset_for_new_solution(states, aid, settings):
+def reset_for_new_solution(states, aid, settings, work):
     """Reset the learnt scatter and the correlated error of fixes when the receiver changes its kind of solution.
 
     A sudden change of the accuracy that it claims means another kind (single, float, fixed): what was learnt of the
@@ -58,7 +58,8 @@ def reset_for_new_solution(states, aid, settings):
     state, variance = states[FILTER], aid.payload[XX] + aid.payload[YY]
     last = state.window.last_fix_variance[aid.source]
     if max(variance, last) > SAME_SOLUTION * min(variance, last):
-        forget_scatter(state, states[HUMBLE], aid.source, settings)
+        linearize(state, aid, settings, work)
+        forget_scatter(state, states[HUMBLE], aid.source, settings, work)
     state.window.last_fix_variance[aid.source] = variance
 
 

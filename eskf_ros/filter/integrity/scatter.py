@@ -99,8 +99,8 @@ NOTABLE_CALM = 0.5
 LEAST_INTERVAL = 0.05
 """s; shortest interval of fixes."""
 
-LEAST_LASTING = 0.5
-"""Least share of a lasting error that is worth the augmented states."""
+LEAST_LASTING = 1.0
+"""Least variance of a lasting error, over that of the new errors, that is worth the augmented states."""
 
 SHORT_SUPPORT = 5.0
 """s; a position that fixes have supported for less may be what is wrong when the next fixes are away from it."""
@@ -121,14 +121,17 @@ def copy_scatter(state, lane, source):
 
 
 @njit
-def forget_scatter(state, lane, source, settings):
+def forget_scatter(state, lane, source, settings, work):
     """Forget what was learnt of the fixes of a receiver, and their lasting error: it has changed its kind of solution.
 
-    The new fixes show the lasting error of the old ones: what of it is in the position is an error like any other now.
+    The first fix of the new kind, in ``work``, shows the lasting error of the old ones: what of it is in the position is
+    an error like any other now, as large as the innovation says (the estimate of greatest likelihood), up to what it
+    was thought to be.
     """
     for i in range(3):
         if state.scatter.calm[source] > 0.0:
-            state.covariance[POSITION + i, POSITION + i] += held_variance(state, i)
+            shown = work.innovation[i] ** 2 - state.covariance[POSITION + i, POSITION + i] - work.noise[i, i]
+            state.covariance[POSITION + i, POSITION + i] += min(max(shown, 0.0), held_variance(state, i))
         state.scatter.share[source, i] = 0.0
     state.scatter.lasting[source] = 0.0
     state.scatter.calm[source] = 0.0
@@ -303,7 +306,7 @@ def update_shares(state, lane, source, settings, work):
     found = max(found, min(off * off / claimed, LARGEST_SPREAD))
     lasting = scatter.lasting[source]
     found = max(found, lasting * largest_square(state, settings.position_error_at) / LARGEST_VALUE**2)
-    found = found if found > LEAST_LASTING else 0.0
+    found = found if found > LEAST_LASTING * scatter.white[source] else 0.0
     if found > STEADY * lasting or found * STEADY < lasting:
         scatter.lasting[source] = found
         if found > 0.0:
