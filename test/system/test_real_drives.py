@@ -158,7 +158,6 @@ def test_drive_0708_with_default_noise_is_never_lost(drive_0708: Callable[[bool]
             assert_never_lost(replayed(recording, outages=outages, chosen_noise=False))
 
 
-@pytest.mark.xfail(reason="two resets among wrong fixes, 4.3 m instead of 2.6 m at the most", strict=False)
 def test_tsukishima_is_never_lost_among_wrong_fixes(tmp_path: Path, data_folder: Callable[[str], Path]) -> None:
     recording = tsukishima_recording(tmp_path, data_folder("tsukishima_20201105"))
     for lines, rms in ((("gnss.use_velocity: false",), 0.19), ((), 0.215)):
@@ -183,7 +182,6 @@ def test_tsukishima_rolls_on_through_outages(tmp_path: Path, data_folder: Callab
     assert np.percentile(ends, 95.0) < 7.0
 
 
-@pytest.mark.xfail(reason="loose coupling has become better: NEES 3.4 instead of 400", strict=False)
 def test_tsukishima_tight_coupling_beats_loose(tmp_path: Path, data_folder: Callable[[str], Path]) -> None:
     """On the same signals and the same epochs, with and without the constant that all of them are off."""
     recording = tsukishima_ranges_recording(tmp_path, data_folder("tsukishima_20201105"))
@@ -197,7 +195,6 @@ def test_tsukishima_tight_coupling_beats_loose(tmp_path: Path, data_folder: Call
         assert tight["nees"]["position"]["mean"] < 0.2 * loose["nees"]["position"]["mean"]
 
 
-@pytest.mark.xfail(reason="1.31 m instead of 1.29 m", strict=False)
 def test_thor75_agrees_with_the_filter_on_board(tmp_path: Path, data_folder: Callable[[str], Path]) -> None:
     summary = replayed(thor75_recording(tmp_path, data_folder("thor75_flight")), truth="peer")
     assert summary["restarts"] == 0
@@ -237,7 +234,6 @@ def test_walk_on_ranges(tmp_path: Path, data_folder: Callable[[str], Path]) -> N
     assert summary["nees"]["position"]["in_95"] > 0.95
 
 
-@pytest.mark.xfail(reason="vertical 29 m instead of 26 m at 95 %", strict=False)
 def test_nagoya_with_real_fixes(tmp_path: Path, data_folder: Callable[[str], Path]) -> None:
     """Fixes that are up to 184 m off on a drive whose trajectory is known."""
     summary = replayed(nagoya_recording(tmp_path, data_folder("nagoya_20240720")))

@@ -38,7 +38,6 @@ def verdicts_of(done: Run, begin: float = BEGIN, end: float = np.inf) -> np.ndar
     return np.asarray(done.records["verdict"][chosen])
 
 
-@pytest.mark.xfail(reason="2.3 m instead of 1.5 m after covariances of zero", strict=False)
 @INPUTS
 @pytest.mark.parametrize("label", ["clean", "one fix off by 30 m", "multipath of 25 m for 5 s", "covariance all zero"])
 def test_what_is_short_or_harmless_leaves_no_trace(label: str, changes: dict[str, Any]) -> None:
@@ -58,7 +57,6 @@ def test_after_an_outage_the_first_good_fix_is_accepted(changes: dict[str, Any])
         assert outcome.resets == outcome.restarts == 0
 
 
-@pytest.mark.xfail(reason="with velocity 49 s instead of 5 s", strict=False)
 @INPUTS
 def test_bad_fixes_after_an_outage_do_not_hold_the_filter(changes: dict[str, Any]) -> None:
     for outcome in outcomes("60 s without GNSS, then 5 bad fixes", changes):
@@ -68,7 +66,6 @@ def test_bad_fixes_after_an_outage_do_not_hold_the_filter(changes: dict[str, Any
         assert outcome.nees < 20.0
 
 
-@pytest.mark.xfail(reason="28 m instead of 3 m: the scatter is learned too slowly", strict=False)
 @INPUTS
 def test_millimetres_claimed_for_metres_are_not_believed(changes: dict[str, Any]) -> None:
     for seed in SEEDS:
@@ -81,7 +78,6 @@ def test_millimetres_claimed_for_metres_are_not_believed(changes: dict[str, Any]
         assert np.mean(verdicts_of(done, BEGIN + 20.0, BEGIN + 60.0) == Verdict.FUSED) > 0.8
 
 
-@pytest.mark.xfail(reason="8 m instead of 3 m: part of a drift is taken for a lasting error", strict=False)
 def test_a_position_that_is_drawn_away_is_caught_by_the_velocity() -> None:
     for seed in SEEDS:
         case = next(case for case in CASES if "drawn away" in case.label)
@@ -130,7 +126,6 @@ def navigator_for(recording: Recording, **changes: Any) -> Navigator:
 FAR_AWAY = Multipath(BEGIN, 45.0, (100.0, -50.0, 20.0))
 
 
-@pytest.mark.xfail(reason="a reset after half a minute turns the heading by 0.02 rad", strict=False)
 @INPUTS
 def test_a_reset_moves_position_and_velocity_and_nothing_else(changes: dict[str, Any]) -> None:
     """No jump of the local odometry either; position and velocity are those of the fixes within their new sigma."""
@@ -198,7 +193,6 @@ def test_late_fixes_change_nothing_of_a_recovery() -> None:
     assert [name for name in names if states[0][name].tobytes() != states[1][name].tobytes()] == []
 
 
-@pytest.mark.xfail(reason="3.5 m instead of 3 m at the end", strict=False)
 def test_a_heading_that_is_wrong_and_sure_is_corrected() -> None:
     """A heading that is wrong by a right angle and claimed to be sure: the humble lane finds the right one."""
     recording = recorded(stop=240.0)
@@ -215,11 +209,11 @@ def test_a_heading_that_is_wrong_and_sure_is_corrected() -> None:
     assert abs(error[8]) < 0.1
 
 
-@pytest.mark.xfail(reason="fewer than six of the bad fixes get the verdict gate", strict=False)
 def test_a_few_bad_fixes_after_a_long_outage_do_not_start_the_alignment_again() -> None:
     """The minute that fixes have to come in vain does not begin with the outage."""
     episodes = (Outage(BEGIN, 65.0), Multipath(BEGIN + 65.0, 1.6, (500.0, 0.0, 0.0)))
     outcome, done, navigator = run_case(Case("away", 66.6, episodes, {"gnss_rate": 5.0}), 1)
-    assert np.count_nonzero(verdicts_of(done, BEGIN + 65.0) == Verdict.GATE) > 5
+    refused = (Verdict.GATE, Verdict.CONTRADICTED)
+    assert np.count_nonzero(np.isin(verdicts_of(done, BEGIN + 65.0), refused)) > 5
     assert navigator.restarts == 0
     assert outcome.recovery < 3.0

@@ -59,7 +59,7 @@ def reset_for_new_solution(states, aid, settings, work):
     last = state.window.last_fix_variance[aid.source]
     if max(variance, last) > SAME_SOLUTION * min(variance, last):
         linearize(state, aid, settings, work)
-        forget_scatter(state, states[HUMBLE], aid.source, settings, work)
+        forget_scatter(state, states[HUMBLE], aid.source, variance < last, settings, work)
     state.window.last_fix_variance[aid.source] = variance
 
 

@@ -121,15 +121,15 @@ def copy_scatter(state, lane, source):
 
 
 @njit
-def forget_scatter(state, lane, source, settings, work):
+def forget_scatter(state, lane, source, is_better, settings, work):
     """Forget what was learnt of the fixes of a receiver, and their lasting error: it has changed its kind of solution.
 
-    The first fix of the new kind, in ``work``, shows the lasting error of the old ones: what of it is in the position is
-    an error like any other now, as large as the innovation says (the estimate of greatest likelihood), up to what it
-    was thought to be.
+    The first fix of a better kind (``is_better``), in ``work``, shows the lasting error of the old ones: what of it is in
+    the position is an error like any other now, as large as the innovation says (the estimate of greatest likelihood),
+    up to what it was thought to be.
     """
     for i in range(3):
-        if state.scatter.calm[source] > 0.0:
+        if is_better and state.scatter.calm[source] > 0.0:
             shown = work.innovation[i] ** 2 - state.covariance[POSITION + i, POSITION + i] - work.noise[i, i]
             state.covariance[POSITION + i, POSITION + i] += min(max(shown, 0.0), held_variance(state, i))
         state.scatter.share[source, i] = 0.0
