@@ -135,6 +135,9 @@ def fuse_receiver(states, aid, gate, settings, work):
         forget_corrections(state)
         forget_spread(state, humble, settings)
     note(state, aid.stream, aid.source, aid.verdict)
+    if not heard:
+        # A lane that starts now has its own noise over an outage that may follow.
+        start(states, settings)
 
 
 @njit
