@@ -16,7 +16,7 @@ from eskf_ros.filter.alignment.heading_from_turning import SPOT
 from eskf_ros.filter.alignment.heading_search import SEARCH
 from eskf_ros.filter.alignment.heading_sensors import CANDIDATE
 from eskf_ros.filter.alignment.levelling import LEVELLING
-from eskf_ros.filter.inertial.covariance import EXCITATION
+from eskf_ros.filter.inertial.covariance import EXCITATION, TURNED_COLUMNS
 from eskf_ros.filter.inertial.navigation_frame import FRAME
 from eskf_ros.filter.inertial.sample_quality import LEAST_FORCE_JUMP, LEAST_RATE_JUMP, SAMPLE_QUALITY
 from eskf_ros.filter.inertial.stamps import IMU_STAMPS
@@ -186,8 +186,8 @@ SETTINGS = np.dtype(
 
 WORK = np.dtype(
     [
-        ("half", "f8", (ACCEL_BIAS, ERROR_SIZE)),
-        ("turned", "f8", (ERROR_SIZE, ACCEL_BIAS)),
+        ("half", "f8", (ACCEL_BIAS, ERROR_CAPACITY)),
+        ("turned", "f8", (ERROR_SIZE, TURNED_COLUMNS)),
         ("jacobian", "f8", (3, ERROR_CAPACITY)),
         ("innovation", "f8", (3,)),
         ("noise", "f8", (3, 3)),

@@ -31,6 +31,7 @@ from support.kernels import (
     make_settings,
     make_state,
     random_covariance,
+    random_state,
     to_quaternion,
     to_rotation,
 )
@@ -594,3 +595,12 @@ def test_far_datum_levels_along_the_local_vertical() -> None:
     assert math.degrees(math.acos(up[2])) == pytest.approx(4.5, abs=0.02)
     measured_up = to_rotation(state["attitude"]).apply(force / 9.81)
     np.testing.assert_allclose(measured_up, up, rtol=0.0, atol=1e-6)
+
+
+def test_covariance_of_a_gyro_bias_at_rest_is_exactly_symmetric() -> None:
+    for seed in range(20):
+        state = random_state(seed)
+        up = navigation_frame.local_up(state)
+        rate = (1e-3, -2e-3, 5e-4)
+        levelling.update_gyro_bias_at_rest(state, (0.0, 0.0, 0.0), 1e-4, rate, up, 5.0, True, make_settings())
+        assert (core(state) == core(state).T).all()

@@ -272,7 +272,7 @@ def update_gyro_bias_at_rest(state, prior_bias, prior, mean_rate, up, duration, 
     for i in range(3):
         state.gyro_bias[i] = prior_bias[i] + bias[i]
         for j in range(3):
-            state.covariance[GYRO_BIAS + i, GYRO_BIAS + j] = (along - across) * up_body[i] * up_body[j]
+            state.covariance[GYRO_BIAS + i, GYRO_BIAS + j] = (along - across) * (up_body[i] * up_body[j])
         state.covariance[GYRO_BIAS + i, GYRO_BIAS + i] += across
 
 

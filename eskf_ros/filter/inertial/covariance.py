@@ -12,7 +12,8 @@ One interval is integrated to second order: the attitude error of mid-interval e
 new velocity error the position. This transition matrix has nine rows other than those of the identity. It is never
 formed: it is applied to the columns of P, and again to the columns of the transpose of the result. The bias rows do not
 change, so the second round has nine columns only. The core does not depend on the augmented states: the transition acts
-on their columns alone.
+on their columns in the first round alone. Columns are taken four at a time, as the processor does; what the last four
+hold besides is not used.
 
 The force in F is not the measured one: of its horizontal part only as much enters as stands out from its own error
 (`credible_force`).
@@ -24,7 +25,7 @@ import math
 
 import numpy as np
 
-from eskf_ros.compiled import njit
+from eskf_ros.compiled import njit, njit_in_caller
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE
 from eskf_ros.geodesy.earth import SEMI_MAJOR_AXIS
 from eskf_ros.geodesy.rotation import dot, rotate
@@ -78,16 +79,25 @@ def acceleration_variance(covariance, rotation, force):
         turned = (0.0, force[2], -force[1]) if axis == 0 else (-force[2], 0.0, force[0])
         row = (turned[0], turned[1], turned[2], -r[0], -r[1], -r[2])
         for i in range(6):
+            # Sums of their own: each addition waits for the one before in the same sum.
+            part = 0.0
             for j in range(6):
-                total += row[i] * row[j] * covariance[ATTITUDE + i, ATTITUDE + j]
+                part += row[j] * covariance[ATTITUDE + i, ATTITUDE + j]
+            total += row[i] * part
     return 0.5 * total
 
+
+ABREAST = 4
+"""Columns of the covariance that the processor takes at a time: single ones cost as much as four."""
+
+TURNED_COLUMNS = -(-ACCEL_BIAS // ABREAST) * ABREAST
+"""Columns of the second round: the first nine, and three that are not used."""
 
 UNKNOWN_ATTITUDE = 1.0
 """rad; standard deviation of an attitude that is as good as unknown."""
 
 
-@njit
+@njit_in_caller
 def apply_transition(columns, out, count, rotation, force, up, gravity_gradient, earth_rate, dt, coupling):
     """Write the nine changing rows of one interval's transition matrix times the first ``count`` columns to ``out``.
 
@@ -95,6 +105,9 @@ def apply_transition(columns, out, count, rotation, force, up, gravity_gradient,
     ``up``: unit vector (map); ``gravity_gradient``: gravity over Earth radius (1/s2); ``earth_rate`` (rad/s, map);
     ``dt`` in s. ``coupling`` 0 cuts the velocity off from attitude and accelerometer bias (unknown heading), 1 is the
     full model.
+
+    Over 60 lines: one loop, a part of its caller, where the compiler knows how far apart rows are in memory and that
+    they do not overlap; only then does it take several columns at a time.
     """
     r00, r01, r02 = rotation[0][0] * dt, rotation[0][1] * dt, rotation[0][2] * dt
     r10, r11, r12 = rotation[1][0] * dt, rotation[1][1] * dt, rotation[1][2] * dt
@@ -190,7 +203,7 @@ def propagate_axis_noise(covariance, rotation, density, dt):
                 covariance[6 + i, 6 + j] += attitude * dt
 
 
-@njit
+@njit_in_caller
 def propagate_covariance(covariance, size, rotation, force, gravity, earth_rate, dt, coupling, work):
     """Apply one interval's transition matrix on both sides of the covariance; arguments as for `apply_transition`.
 
@@ -200,24 +213,18 @@ def propagate_covariance(covariance, size, rotation, force, gravity, earth_rate,
     up = (-gravity[0] / strength, -gravity[1] / strength, -gravity[2] / strength)
     gradient = strength / SEMI_MAJOR_AXIS
     half = work.half
-    apply_transition(covariance, half, ERROR_SIZE, rotation, force, up, gradient, earth_rate, dt, coupling)
+    count = min(-(-size // ABREAST) * ABREAST, len(covariance))
+    apply_transition(covariance, half, count, rotation, force, up, gradient, earth_rate, dt, coupling)
     for i in range(ACCEL_BIAS):
         for j in range(ERROR_SIZE):
             work.turned[j, i] = half[i, j]
-    apply_transition(work.turned, covariance, ACCEL_BIAS, rotation, force, up, gradient, earth_rate, dt, coupling)
+    apply_transition(work.turned, covariance, TURNED_COLUMNS, rotation, force, up, gradient, earth_rate, dt, coupling)
     for i in range(ACCEL_BIAS):
         for j in range(i):
             covariance[i, j] = covariance[j, i]
-        for j in range(ACCEL_BIAS, ERROR_SIZE):
+        for j in range(ACCEL_BIAS, size):
             covariance[i, j] = half[i, j]
             covariance[j, i] = half[i, j]
-    if size > ERROR_SIZE:
-        columns = covariance[:, ERROR_SIZE:size]
-        count = size - ERROR_SIZE
-        apply_transition(columns, columns, count, rotation, force, up, gradient, earth_rate, dt, coupling)
-        for i in range(ACCEL_BIAS):
-            for j in range(ERROR_SIZE, size):
-                covariance[j, i] = covariance[i, j]
 
 
 @njit

@@ -19,6 +19,7 @@ from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ATTITUDE, GYRO_BIAS, POSITION, VELOCITY
 from eskf_ros.filter.tight.signal import (
     CN0,
+    FLAGS,
     MEASURED,
     SATELLITE_VELOCITY,
     STD,
@@ -29,7 +30,9 @@ from eskf_ros.filter.tight.signal import (
 )
 from eskf_ros.geodesy.earth import east_north_up_to_ecef, ecef_to_geodetic
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix
-from eskf_ros.gnss.geometry import elevation_azimuth
+from eskf_ros.gnss.geometry import elevation_azimuth, turned
+from eskf_ros.gnss.ranges import ALREADY_TURNED
+from eskf_ros.gnss.signals import SPEED_OF_LIGHT
 from eskf_ros.gnss.weighting import DEFAULT_WEIGHTING, doppler_std
 
 SIZE = 1
@@ -46,7 +49,10 @@ def predict(state, payload, settings):
     latitude, longitude, _ = ecef_to_geodetic(antenna[0], antenna[1], antenna[2])
     elevation, _ = elevation_azimuth(unit, east_north_up_to_ecef(latitude, longitude))
     v = SATELLITE_VELOCITY
-    relative = (payload[v] - velocity[0], payload[v + 1] - velocity[1], payload[v + 2] - velocity[2])
+    satellite = (payload[v], payload[v + 1], payload[v + 2])
+    if int(payload[FLAGS]) & ALREADY_TURNED == 0:
+        satellite = turned(satellite, length / SPEED_OF_LIGHT)
+    relative = (satellite[0] - velocity[0], satellite[1] - velocity[1], satellite[2] - velocity[2])
     along = dot(unit, relative)
     turning = (
         (relative[0] - along * unit[0]) / length,
@@ -95,10 +101,10 @@ def linearize(state, payload, settings, work):
     moved = cross(turning, lever)
     along, aligned = dot(unit, earth), dot(lever, earth)
     # u R [lever_arm]x for the gyro bias.
-    turned = cross(rotate_back(rotation, unit), arm)
+    by_bias = cross(rotate_back(rotation, unit), arm)
     for i in range(3):
         work.jacobian[0, ATTITUDE + i] = swayed[i] + moved[i] - along * lever[i] + aligned * unit[i]
-        work.jacobian[0, GYRO_BIAS + i] = -turned[i]
+        work.jacobian[0, GYRO_BIAS + i] = -by_bias[i]
     return SIZE
 
 
