@@ -17,7 +17,7 @@ settings.register_profile("ci", deadline=None, derandomize=True)
 settings.load_profile("ci" if os.environ.get("CI") else "developer")
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def data_folder() -> Callable[[str], Path]:
     """`data_folder("drive_0708")` is the folder of that real recording; the test is skipped where it is missing."""
 

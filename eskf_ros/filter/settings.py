@@ -121,7 +121,15 @@ def describe_imu_noise(settings: np.ndarray, imu: Imu) -> None:
         imu.accel_bias_random_walk,
         imu.gyro_bias_random_walk,
     )
-    settings["humble_noise"] = np.square(np.maximum(HUMBLE_NOISE, np.multiply(told, (4.0, 4.0, 1.0, 1.0))))
+    # Where the estimation of a bias is switched off it is off in both lanes.
+    is_estimated = (
+        True,
+        True,
+        imu.accel_bias_std > 0.0 or imu.accel_bias_random_walk > 0.0,
+        imu.gyro_bias_std > 0.0 or imu.gyro_bias_random_walk > 0.0,
+    )
+    noise = np.maximum(HUMBLE_NOISE, np.multiply(told, (4.0, 4.0, 1.0, 1.0)))
+    settings["humble_noise"] = np.square(noise * is_estimated)
 
 
 def place_optional_states(settings: np.void, parameters: Parameters) -> None:

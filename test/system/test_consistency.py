@@ -88,7 +88,6 @@ def test_nees_is_that_of_the_covariance(name: str) -> None:
     assert inconsistencies(default_ensemble(name)) == []
 
 
-@pytest.mark.xfail(reason="the noise of fixes is learned now, and passes", strict=False)
 @pytest.mark.parametrize(
     ("wrong", "block"),
     [
@@ -136,7 +135,6 @@ def test_rare_fixes_do_not_spoil_the_start(interval: float) -> None:
     assert root_mean(horizontal_error(runs, settled)) < 1.3 * root_mean(horizontal_variance(runs, settled))
 
 
-@pytest.mark.xfail(reason="2.7 times instead of 4: the humble lane estimates biases all the same", strict=False)
 def test_without_bias_estimation_the_tunnel_costs_several_times_more() -> None:
     """What the filter learns of the biases before the tunnel is what carries it through.
 

@@ -83,7 +83,6 @@ def test_velocities_stamped_late_are_harmless_once_their_offset_is_given() -> No
     assert rms(cured) < 1.1 * rms(clean)
 
 
-@pytest.mark.xfail(reason="advice beside a lever arm that is 1.5 m off names the velocities, too", strict=False)
 @pytest.mark.parametrize(
     ("name", "given", "parameter"),
     [
