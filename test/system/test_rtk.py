@@ -81,7 +81,7 @@ def test_the_estimate_is_as_good_as_the_solution() -> None:
 
 
 def test_a_receiver_with_lasting_errors_is_not_believed_ten_times_a_second() -> None:
-    """1 m that lasts a minute and 0.5 m that does not, at 10 Hz: told of it, or left to find it, the covariance is honest.
+    """1 m that lasts a minute and 0.5 m that does not, at 10 Hz: told of it, or left to find it, it is honest.
 
     With all that is known of lasting errors switched off it is far off.
     """

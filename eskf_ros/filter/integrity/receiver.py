@@ -4,7 +4,7 @@ The humble lane (`humble_lane`) says whether a message jumps. One that does not 
 expect it, with noise that brings it onto the innovation gate. One that jumps is refused until it has persisted. Where
 the heading is unknown there is no humble lane: the filter, whose noise is wide then, judges for itself.
 
-How much messages scatter about the humble lane decides with how much noise they are fused (`scatter`).
+How much messages scatter about the humble lane decides with how much noise they are fused (`scatter`, `fix_errors`).
 """
 
 from __future__ import annotations
@@ -13,6 +13,14 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.history.records import XX, YY
+from eskf_ros.filter.integrity.fix_errors import (
+    follow_calm_error,
+    reset_scatter,
+    forget_spread,
+    note_claims,
+    propagate_walk,
+    update_shares,
+)
 from eskf_ros.filter.integrity.heading_corrections import HEADING, forget_corrections, weigh_correction
 from eskf_ros.filter.integrity.humble_lane import (
     hear,
@@ -26,16 +34,10 @@ from eskf_ros.filter.integrity.recovery import note, note_reset
 from eskf_ros.filter.integrity.refusal import IMU_ASTRAY, JUMP_GATE, RECEIVER_STEPPED, kind_of, note_jump
 from eskf_ros.filter.integrity.scatter import (
     copy_scatter,
-    follow_calm_error,
-    forget_scatter,
-    forget_spread,
     learn_from_change,
     learn_from_fix,
     learn_from_velocity,
     learn_walk,
-    note_claims,
-    propagate_walk,
-    update_shares,
 )
 from eskf_ros.filter.measurements.kalman_update import apply, judge, project, update
 from eskf_ros.filter.state.enums import Stream, Verdict
@@ -59,7 +61,7 @@ def reset_for_new_solution(states, aid, settings, work):
     last = state.window.last_fix_variance[aid.source]
     if max(variance, last) > SAME_SOLUTION * min(variance, last):
         linearize(state, aid, settings, work)
-        forget_scatter(state, states[HUMBLE], aid.source, variance < last, settings, work)
+        reset_scatter(state, states[HUMBLE], aid.source, variance < last, settings, work)
     state.window.last_fix_variance[aid.source] = variance
 
 
@@ -68,28 +70,10 @@ def fuse_receiver(states, aid, gate, settings, work):
     """Fuse or refuse a position or velocity of GNSS; ``gate`` is the innovation gate of the filter (NIS)."""
     state, humble = states[FILTER], states[HUMBLE]
     start(states, settings)
-    heard = is_running(states)
-    jumps, believed, humble_nis, humble_log = False, 0, 0.0, 0.0
     is_position = aid.stream == Stream.GNSS_POSITION
     if is_position:
         propagate_walk(state, state, aid.source)
-    if heard:
-        if is_position:
-            propagate_walk(state, humble, aid.source)
-        copy_scatter(state, humble, aid.source)
-        jumps, believed, humble_nis, humble_log = hear(states, aid, gate, settings, work)
-        if believed == IMU_ASTRAY:
-            reset_to_humble_lane(states)
-        elif believed == RECEIVER_STEPPED:
-            linearize(state, aid, settings, work)
-            reset_to_message(state, state.trust, aid, False, work)
-        if humble.heading_known == 0:
-            heard = False
-        elif jumps and is_position:
-            learn_from_change(state, humble, aid.source, False, settings, work)
-            update_shares(state, humble, aid.source, settings, work)
-        elif not jumps and not believed:
-            learn(state, humble, aid, humble_nis, settings, work)
+    heard, jumps, believed, humble_nis, humble_log = judge_with_humble_lane(states, aid, gate, settings, work)
     size = linearize(state, aid, settings, work)
     if is_position:
         note_claims(state, aid.source, settings, work)
@@ -115,14 +99,10 @@ def fuse_receiver(states, aid, gate, settings, work):
             reset_to_message(state, state.trust, aid, True, work)
             linearize(state, aid, settings, work)
             update(state, size, math.inf, work)
-    is_fused = believed != 0 or aid.verdict in (Verdict.FUSED, Verdict.WEIGHED_DOWN)
-    if is_fused and is_position:
-        follow_calm_error(state, aid.source, work)
-        learn_walk(state, aid.source, settings, work)
-    if state.heading_known == 0 and is_position and not believed:
-        learn_from_change(state, state, aid.source, is_fused, settings, work)
-        update_shares(state, state, aid.source, settings, work)
-    if heard and not jumps and not believed:
+    if is_position and aid.verdict != Verdict.BAD_COVARIANCE:
+        is_fused = believed != 0 or aid.verdict in (Verdict.FUSED, Verdict.WEIGHED_DOWN)
+        learn_in_filter(state, aid, is_fused, believed, settings, work)
+    if heard and not jumps and not believed and determinant > 0.0:
         drifts = weigh_correction(state, heading_variance, work.correction[HEADING])
         worse = weigh_evidence(states, aid, aid.nis, math.log(determinant), humble_nis, humble_log, settings)
         if worse or drifts:
@@ -138,6 +118,50 @@ def fuse_receiver(states, aid, gate, settings, work):
     if not heard:
         # A lane that starts now has its own noise over an outage that may follow.
         start(states, settings)
+
+
+@njit
+def judge_with_humble_lane(states, aid, gate, settings, work):
+    """Let the humble lane hear a message, and learn from it; reset the filter where messages are believed at last.
+
+    Returns whether the lane has heard it, and what `hear` returns.
+    """
+    state, humble = states[FILTER], states[HUMBLE]
+    if not is_running(states):
+        return False, False, 0, 0.0, 0.0
+    is_position = aid.stream == Stream.GNSS_POSITION
+    if is_position:
+        propagate_walk(state, humble, aid.source)
+    copy_scatter(state, humble, aid.source)
+    jumps, believed, nis, log_determinant = hear(states, aid, gate, settings, work)
+    if believed == IMU_ASTRAY:
+        reset_to_humble_lane(states)
+    elif believed == RECEIVER_STEPPED:
+        linearize(state, aid, settings, work)
+        reset_to_message(state, state.trust, aid, False, work)
+    if humble.heading_known == 0:
+        return False, jumps, believed, nis, log_determinant
+    if jumps and is_position:
+        learn_from_change(state, humble, aid.source, False, settings, work)
+        update_shares(state, humble, aid.source, settings, work)
+    elif not jumps and not believed:
+        learn(state, humble, aid, nis, settings, work)
+    return True, jumps, believed, nis, log_determinant
+
+
+@njit
+def learn_in_filter(state, aid, is_fused, believed, settings, work):
+    """Learn from a fix in the filter, after its update, how far the position follows the fixes and how they walk.
+
+    While the heading is unknown the filter also takes the part of the humble lane, but for messages that are
+    ``believed`` after many were refused.
+    """
+    if is_fused:
+        follow_calm_error(state, aid.source, work)
+        learn_walk(state, aid.source, settings, work)
+    if state.heading_known == 0 and not believed:
+        learn_from_change(state, state, aid.source, is_fused, settings, work)
+        update_shares(state, state, aid.source, settings, work)
 
 
 @njit

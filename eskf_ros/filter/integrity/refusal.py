@@ -90,8 +90,8 @@ def is_small(kind, work):
 def note_jump(state, aid, kind, work):
     """Count a message that jumps; return whether those refused have agreed for long enough to be believed, and why.
 
-    0: they have not; `RECEIVER_STEPPED`: the offset stayed the same; `IMU_ASTRAY`: it grew, or both kinds of messages of
-    the receiver contradict the IMU.
+    0: they have not; `RECEIVER_STEPPED`: the offset stayed the same; `IMU_ASTRAY`: it grew, or both kinds of messages
+    of the receiver contradict the IMU.
 
     ``work`` holds its innovation in the filter, and its noise. Offsets that stay the same are those of a
     receiver that has stepped aside; offsets that grow come from an IMU that goes astray, unless the velocities of the

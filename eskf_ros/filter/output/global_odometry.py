@@ -9,7 +9,7 @@ import numpy as np
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.levelling import UNKNOWN_SPEED
 from eskf_ros.filter.inertial.navigation_frame import body_rate, heading_of
-from eskf_ros.filter.integrity.scatter import held_variance
+from eskf_ros.filter.integrity.fix_errors import held_variance
 from eskf_ros.filter.output.status import quality_of, status_of
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, GYRO_BIAS, POSITION, VELOCITY
 from eskf_ros.geodesy.rotation import cross, from_matrix, from_rotation_vector, multiply, rotate, rotate_back, to_matrix

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.integrity.fix_errors import held_variance
 from eskf_ros.filter.integrity.heading_monitor import has_lasting_difference
-from eskf_ros.filter.integrity.scatter import held_variance
 from eskf_ros.filter.state.enums import Quality, Status
 from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, POSITION
 from eskf_ros.filter.state.time import NEVER
