@@ -5,6 +5,7 @@ from __future__ import annotations
 from eskf_ros.compiled import njit, njit_in_caller
 from eskf_ros.filter.alignment.first_fix import reset_position_to_fix
 from eskf_ros.filter.alignment.heading import reset_heading_from_memory, search_heading
+from eskf_ros.filter.alignment.heading_course import reset_contradicted_heading
 from eskf_ros.filter.alignment.heading_from_wheels import search_with_wheels
 from eskf_ros.filter.alignment.heading_sensors import update_unknown_heading
 from eskf_ros.filter.alignment.levelling import reset_level_to_moving
@@ -107,6 +108,7 @@ def offer(states, aid, heading_before, settings, work):
         find_faults(state, work)
         if is_gnss:
             watch_receiver(state, aid, work, settings)
+            reset_contradicted_heading(state, settings)
     if aid.verdict == Verdict.FUSED and state.heading_known == 0:
         search_heading(state, aid, gate, settings, work)
     if aid.stream == Stream.GNSS_POSITION:

@@ -196,6 +196,7 @@ WORK = np.dtype(
         ("solution", "f8", (3,)),
         ("solution_covariance", "f8", (3, 3)),
         ("shared", "f8", (3, ERROR_CAPACITY)),
+        ("holds_heading", "i8"),
         ("projected", "f8", (3, ERROR_CAPACITY)),
         ("innovation_covariance", "f8", (3, 3)),
         ("noise_seen", "f8", (3, 3)),
@@ -223,7 +224,7 @@ WORK = np.dtype(
 
 - ``half``, ``turned``: the covariance after one side of the transition, and its transpose.
 - ``jacobian``, ``innovation``, ``noise``: the measurement to fuse; ``shared``: covariance of its noise with the errors,
-  zero unless the measurement writes it.
+  zero unless the measurement writes it; ``holds_heading``: 1 for GNSS, which shows the heading by accelerations alone.
 - ``projected`` ... ``correction``: intermediate results of the update.
 - ``effect``, ``fault_covariance``: derivative of the measurement by the faults of its receiver, and the covariance of
   these (`installation_monitor`).
@@ -251,7 +252,7 @@ _NEVER = {
     "scatter": ("last_stamp", "walk_stamp"),
     "installation": ("stamp", "checked"),
     "mag": ("disturbed_stamp",),
-    "heading": ("given_stamp",),
+    "heading": ("given_stamp", "contradicted_since"),
     "rest": (
         "block_end",
         "moving_stamp",

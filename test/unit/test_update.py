@@ -142,6 +142,32 @@ def test_corrections_of_the_tilt_say_nothing_of_the_heading() -> None:
     assert core(state)[8, 8] == pytest.approx(0.04, rel=1e-9)
 
 
+@pytest.mark.parametrize("believed", [False, True])
+def test_gnss_corrects_the_heading_only_while_an_acceleration_is_believed(believed: bool) -> None:
+    """Else the heading and the gyro bias about the vertical stay, however the IMU is mounted, and nothing else does.
+
+    Would fail with the gain of the update, or with the axes of the IMU taken for those of the map.
+    """
+    state = random_state(5)
+    covariance = random_covariance(6, USUAL_STDS)
+    core(state)[:] = covariance
+    state["excitation"]["left"] = 10.0 if believed else 0.0
+    up = -np.array(gravity_map(state, tuples(state["position_map"])))
+    up /= np.linalg.norm(up)
+    before, rotation, work = copy_of(state), to_rotation(state["attitude"]), measurement(7, 3)
+    work["holds_heading"] = 1
+    assert update(state, 3, OPEN_GATE, work)[0] == Verdict.FUSED
+    turned = work["correction"][6:9].copy()
+    body_up = rotation.inv().apply(up)
+    drifted = state["gyro_bias"] - before["gyro_bias"]
+    is_held = max(abs(up @ turned) / np.linalg.norm(turned), abs(body_up @ drifted) / np.linalg.norm(drifted)) < 1e-9
+    assert is_held is not believed
+    variance = up @ covariance[6:9, 6:9] @ up
+    left = up @ core(state)[6:9, 6:9] @ up
+    assert left < 0.99 * variance if believed else left == pytest.approx(variance, rel=1e-9)
+    assert np.linalg.norm(turned - (up @ turned) * up) > 0.0
+
+
 @given(st.integers(0, 2**31))
 def test_injection_is_the_error_definition(seed: int) -> None:
     state = random_state(seed % 1000)

@@ -31,6 +31,7 @@ CANDIDATE = np.dtype(
         ("candidate_turn", "f8"),
         ("candidate_std", "f8"),
         ("given_stamp", "i8"),
+        ("contradicted_since", "i8"),
         ("disputed", "i8"),
     ],
     align=True,
@@ -42,6 +43,7 @@ CANDIDATE = np.dtype(
   (ns).
 - ``candidate_turn``, ``candidate_std``: the proposed turn of the attitude (rad), and its standard deviation.
 - ``given_stamp``: when a parameter, the memory or a pose gave the heading (ns).
+- ``contradicted_since``: since when the course over ground contradicts that heading (ns).
 - ``disputed``: whether the dual antenna contradicts that heading.
 """
 

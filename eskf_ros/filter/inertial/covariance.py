@@ -72,7 +72,10 @@ def credible_force(excitation, covariance, rotation, force, gravity, dt, noise_d
 
 @njit
 def acceleration_variance(covariance, rotation, force):
-    """Return the variance (m2/s4, mean of the axes x and y of map) of theta x ``force`` - R dba."""
+    """Return the variance (m2/s4, mean of the axes x and y of map) of theta x ``force`` - R dba.
+
+    Of second order, an uncertain heading turns the uncertain bias: R dba moves by theta_z times its length.
+    """
     total = 0.0
     for axis in range(2):
         r = rotation[axis]
@@ -84,7 +87,8 @@ def acceleration_variance(covariance, rotation, force):
             for j in range(6):
                 part += row[j] * covariance[ATTITUDE + i, ATTITUDE + j]
             total += row[i] * part
-    return 0.5 * total
+    bias_variance = (covariance[9, 9] + covariance[10, 10] + covariance[11, 11]) / 3.0
+    return 0.5 * total + covariance[8, 8] * bias_variance
 
 
 ABREAST = 4

@@ -107,6 +107,7 @@ def linearize(state, payload, source, settings, work):
 @njit
 def linearize_antenna(state, measured, source, settings, work):
     """Write innovation and Jacobian of a position (m, map) of the antenna of ``source`` to ``work``, which is clear."""
+    work.holds_heading = 1
     predicted = predict(state, source, settings)
     for i in range(3):
         work.innovation[i] = measured[i] - predicted[i]

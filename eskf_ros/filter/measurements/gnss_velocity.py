@@ -75,6 +75,7 @@ def linearize_antenna(state, measured, source, settings, work):
 
     Its noise is there; the noise of the gyro, which is part of the prediction, is added to it.
     """
+    work.holds_heading = 1
     predicted = predict(state, source, settings)
     for i in range(3):
         work.innovation[i] = measured[i] - predicted[i]

@@ -11,7 +11,10 @@ from eskf_ros.filter.inertial.covariance import update_error_axes
 from eskf_ros.filter.inertial.navigation_frame import local_up
 from eskf_ros.filter.state.enums import Verdict
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, VELOCITY
-from eskf_ros.geodesy.rotation import dot, from_rotation_vector, multiply, normalized, to_matrix
+from eskf_ros.geodesy.rotation import dot, from_rotation_vector, multiply, normalized, rotate_back, to_matrix
+
+TURNING_RATE = 0.1
+"""rad/s; beyond it the robot turns, whatever the bias of its gyro."""
 
 
 @njit
@@ -55,21 +58,54 @@ def apply(state, size, work):
 
     Joseph form with the full product (I - K H) P (I - K H)' + K R K' (Groves, eq. 3.58), evaluated through its
     rank-``size`` parts, and extended by the covariance C of noise and errors (Brown and Hwang, Introduction to Random
-    Signals, section 5.5).
+    Signals, section 5.5). It holds for any gain, also for one that holds the heading.
     """
     inverse = work.innovation_covariance
     for i in range(state.error_size):
-        correction = 0.0
         for a in range(size):
             gain = 0.0
             for b in range(size):
                 gain += work.projected[b, i] * inverse[b, a]
             work.gain[i, a] = gain
-            correction += gain * work.innovation[a]
+    if work.holds_heading == 1 and not is_heading_shown(state):
+        hold_heading(state, size, work)
+    for i in range(state.error_size):
+        correction = 0.0
+        for a in range(size):
+            correction += work.gain[i, a] * work.innovation[a]
         work.correction[i] = correction
     update_covariance(state, size, work)
     update_nominal_state(state, work.correction)
     reset_attitude_error(state, work.correction)
+
+
+@njit
+def is_heading_shown(state):
+    """Say whether the robot moves so that GNSS shows its heading: it accelerates, or the antenna goes round it."""
+    rate, bias = state.imu.smooth_rate, state.gyro_bias
+    turn = (rate[0] - bias[0], rate[1] - bias[1], rate[2] - bias[2])
+    return state.excitation.left > 0.0 or dot(turn, turn) > TURNING_RATE**2
+
+
+@njit
+def hold_heading(state, size, work):
+    """Take the heading and the gyro bias about the vertical, whose integral it is, out of the gain in ``work``.
+
+    GNSS does not see them while no acceleration stands out (`credible_force`) and nothing turns. What the linearised
+    filter would learn all the same, it learns from its own corrections: lever arm, Earth rate and biases turn with the
+    estimate, and with them what is unobservable. Both errors still count in the covariance of the innovation (Schmidt,
+    Application of state-space methods to navigation problems, 1966).
+    """
+    up = local_up(state)
+    up_body = rotate_back(to_matrix(state.attitude), up)
+    for a in range(size):
+        turn, drift = 0.0, 0.0
+        for i in range(3):
+            turn += up[i] * work.gain[ATTITUDE + i, a]
+            drift += up_body[i] * work.gain[GYRO_BIAS + i, a]
+        for i in range(3):
+            work.gain[ATTITUDE + i, a] -= turn * up[i]
+            work.gain[GYRO_BIAS + i, a] -= drift * up_body[i]
 
 
 @njit

@@ -21,6 +21,7 @@ import math
 
 from eskf_ros.compiled import njit, njit_in_caller
 from eskf_ros.filter.alignment.heading import search_with
+from eskf_ros.filter.alignment.heading_course import reset_contradicted_heading
 from eskf_ros.filter.alignment.levelling import reset_level_to_moving
 from eskf_ros.filter.history.timeline import open_record
 from eskf_ros.filter.inertial.navigation_frame import body_rate, heading_of
@@ -99,6 +100,7 @@ def fuse_ranges(states, aids, first, end, settings, work):
     position = (state.position_map[0], state.position_map[1], state.position_map[2])
     heading = heading_of(state, settings)
     offer_epoch(states, aids, first, end, 0 if aids[first].stream == Stream.PSEUDORANGE else 1, settings, work)
+    reset_contradicted_heading(state, settings)
     note_jump(state, position, heading, settings)
 
 

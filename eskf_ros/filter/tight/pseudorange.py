@@ -124,6 +124,7 @@ def linearize(state, payload, source, settings, work):
     if not elevation >= settings.pseudorange.elevation_mask:
         return 0
     clear(work)
+    work.holds_heading = 1
     work.innovation[0] = payload[MEASURED] - predicted
     work.noise[0, 0] = variance(payload, source, elevation, ionosphere, settings)
     lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[0])

@@ -78,6 +78,7 @@ def linearize(state, payload, settings, work):
     if not elevation >= settings.pseudorange.elevation_mask:
         return 0
     clear(work)
+    work.holds_heading = 1
     work.innovation[0] = payload[MEASURED] - predicted
     rotation = to_matrix(state.attitude)
     arm = settings.lever_arms_body[0]
