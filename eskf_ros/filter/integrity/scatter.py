@@ -53,6 +53,9 @@ SCATTER = np.dtype(
   lane once this was corrected (m, map).
 """
 
+VELOCITIES = 1
+"""Kind of message that velocities are (`refusal.kind_of`)."""
+
 SPREAD_GAIN = 0.08
 """Weight of the newest message in the running mean of the spread."""
 
@@ -197,7 +200,8 @@ def is_path_confirmed(state, source):
 
     Else the path may be wrong and not the fixes.
     """
-    return state.doubt == 0.0 and is_live(state, Stream.GNSS_VELOCITY.value, source)
+    is_agreeing = is_live(state, Stream.GNSS_VELOCITY.value, source) and state.trust.refused[VELOCITIES, source] == 0
+    return state.doubt == 0.0 and is_agreeing
 
 
 @njit
