@@ -103,12 +103,13 @@ def note_jump(state, aid, kind, work):
     dt = (aid.stamp - trust.refused_stamp[kind, source]) * 1e-9
     passed = (aid.stamp - trust.refused_since[kind, source]) * 1e-9
     rate = OPENED_VELOCITY_STD if kind == 0 else OPENED_ACCELERATION_STD
-    follows, stays = 0.0, 0.0
+    follows, stays, grows = 0.0, 0.0, 0.0
     for i in range(3):
         variance = state.covariance[VELOCITY + i, VELOCITY + i] if kind == 0 else OPENED_ACCELERATION_STD**2
         variance = BACKED_VELOCITY_STD**2 if is_backed and kind == 0 else variance
         noise = 2.0 * work.noise[i, i]
         follows += (work.innovation[i] - trust.refused_innovation[kind, source, i]) ** 2 / (noise + (rate * dt) ** 2)
+        grows += (work.innovation[i] - trust.first_innovation[kind, source, i]) ** 2 / noise
         stays += (work.innovation[i] - trust.first_innovation[kind, source, i]) ** 2 / (noise + variance * passed**2)
     agrees = stays <= AGREEMENT_GATE or (follows <= AGREEMENT_GATE and not is_backed)
     if trust.refused[kind, source] == 0 or not agrees:
@@ -131,7 +132,7 @@ def note_jump(state, aid, kind, work):
     trust.jump[kind, source] = max(trust.jump[kind, source], math.sqrt(square))
     lasted = aid.stamp - trust.refused_since[kind, source]
     is_alone = not is_live(state, other_stream(aid.stream), source)
-    is_apart = is_alone and stays > AGREEMENT_GATE
+    is_apart = (is_alone and stays > AGREEMENT_GATE) or (kind == 1 and grows > AGREEMENT_GATE)
     is_apart = is_apart or is_other_refused(state, aid.stream, source) or state.heading_known == 0
     patience = SHORT_PATIENCE if is_apart else patience_for(state, aid.stream, source)
     if trust.refused[kind, source] < FEWEST or lasted < patience:
