@@ -201,7 +201,7 @@ def _trace(
     away = position - states["position_map"]
     is_known = states["heading_known"].astype(bool)
     sigma = np.sqrt(np.maximum(covariance[:, 8, 8], 1e-12))
-    was_known = is_known[:-1] & (sigma[:-1] < KNOWN)
+    was_known = is_known[:-1] & (sigma[:-1] < KNOWN) & (np.abs(turn[:-1, 2]) < KNOWN)
     rest = records[(records["stream"] == Stream.ZUPT) & (records["verdict"] == Verdict.FUSED)]["stamp"]
     turning = records[(records["stream"] == Stream.ZARU) & (records["verdict"] == Verdict.FUSED)]["stamp"]
     aids = records[(records["stream"] < SENSOR_STREAMS) & (records["dof"] > 0)]

@@ -252,7 +252,7 @@ _NEVER = {
     "scatter": ("last_stamp", "walk_stamp"),
     "installation": ("stamp", "checked"),
     "mag": ("disturbed_stamp",),
-    "heading": ("given_stamp", "contradicted_since"),
+    "heading": ("given_stamp", "tried_stamp", "contradicted_since"),
     "rest": (
         "block_end",
         "moving_stamp",

@@ -14,11 +14,11 @@ import numpy as np
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.first_fix import START_VELOCITY_STD
 from eskf_ros.filter.alignment.heading import reset_heading
-from eskf_ros.filter.alignment.heading_search import turn_found
+from eskf_ros.filter.alignment.heading_search import forget_search, turn_found
 from eskf_ros.filter.history.records import XX
 from eskf_ros.filter.inertial.navigation_frame import heading_of
 from eskf_ros.filter.state.enums import Stream
-from eskf_ros.filter.state.error_state import ERROR_SIZE, GYRO_BIAS, VELOCITY
+from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, GYRO_BIAS, VELOCITY
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.geodesy.rotation import wrapped
 
@@ -31,6 +31,8 @@ CANDIDATE = np.dtype(
         ("candidate_turn", "f8"),
         ("candidate_std", "f8"),
         ("given_stamp", "i8"),
+        ("tried_stamp", "i8"),
+        ("confirmations", "i8"),
         ("contradicted_since", "i8"),
         ("disputed", "i8"),
     ],
@@ -43,6 +45,8 @@ CANDIDATE = np.dtype(
   (ns).
 - ``candidate_turn``, ``candidate_std``: the proposed turn of the attitude (rad), and its standard deviation.
 - ``given_stamp``: when a parameter, the memory or a pose gave the heading (ns).
+- ``tried_stamp``, ``confirmations``: the same of the heading on trial, and the messages of GNSS that have agreed with
+  it while accelerations showed the heading.
 - ``contradicted_since``: since when the course over ground contradicts that heading (ns).
 - ``disputed``: whether the dual antenna contradicts that heading.
 """
@@ -71,6 +75,12 @@ REFUTING_TIME = 5.0
 
 TRIAL_TIME = 20.0
 """s; rejected headings refute a given heading only if they began within this time after it was given."""
+
+CONFIRMATIONS = 50
+"""Messages of GNSS that must agree with a given heading, while accelerations show it, before it counts as known."""
+
+UNKNOWN_HEADING_STD = math.pi
+"""rad; of a heading that was dropped."""
 
 OPEN_STD = 1.0
 """rad; standard deviation with which the heading is first set; the update by the same message then narrows it."""
@@ -170,3 +180,29 @@ def reset_given_heading(state, aid, settings, work):
             state.covariance[j, i] = 0.0
         state.covariance[i, i] = START_VELOCITY_STD**2
     return True
+
+
+@njit
+def confirm_given_heading(state):
+    """Count a fused message of GNSS for the heading that was given, while accelerations show the heading."""
+    if state.heading.given_stamp == NEVER or state.heading_known == 0 or state.excitation.left == 0.0:
+        return
+    if state.heading.tried_stamp != state.heading.given_stamp:
+        state.heading.tried_stamp = state.heading.given_stamp
+        state.heading.confirmations = 0
+    state.heading.confirmations += 1
+    if state.heading.confirmations >= CONFIRMATIONS:
+        state.heading.given_stamp = NEVER
+
+
+@njit
+def reset_to_unknown_heading(state):
+    """Drop a heading that was given and is refuted by the first motion: it is unknown now, and searched for."""
+    state.heading_known = 0
+    state.heading.given_stamp = NEVER
+    up = ATTITUDE + 2
+    for i in range(len(state.covariance)):
+        state.covariance[up, i] = 0.0
+        state.covariance[i, up] = 0.0
+    state.covariance[up, up] = UNKNOWN_HEADING_STD**2
+    forget_search(state)

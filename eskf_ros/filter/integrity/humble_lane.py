@@ -214,10 +214,11 @@ def reset_to_message(lane, trust, aid, is_inertial, work):
     """Open what a message contradicts, which is believed now; ``work`` holds its innovation and noise.
 
     A position moves the position, and where the IMU is at fault (``is_inertial``) opens the velocity. A velocity moves
-    the velocity. Both are as good as the refused messages agree (``trust``). A fault of the IMU also opens the attitude
-    and the biases.
+    the velocity, and opens the position by the way gone wrong since the first was refused. Both are as good as the
+    refused messages agree (``trust``). A fault of the IMU also opens the attitude and the biases.
     """
     kind = kind_of(aid.stream)
+    lasted = (aid.stamp - trust.refused_since[kind, receiver_of(aid)]) * 1e-9
     block = POSITION if kind == 0 else VELOCITY
     reset_block(lane, block)
     for i in range(3):
@@ -225,6 +226,7 @@ def reset_to_message(lane, trust, aid, is_inertial, work):
             lane.position_map[i] += work.innovation[i]
         else:
             lane.velocity_map[i] += work.innovation[i]
+            lane.covariance[POSITION + i, POSITION + i] += (lasted * work.innovation[i]) ** 2
         change = trust.change[kind, receiver_of(aid), i]
         lane.covariance[block + i, block + i] = 4.0 * work.noise[i, i] + change * change
     if not is_inertial:

@@ -12,13 +12,14 @@ from __future__ import annotations
 import math
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.alignment.heading_sensors import confirm_given_heading, reset_to_unknown_heading
 from eskf_ros.filter.history.records import XX, YY
 from eskf_ros.filter.integrity.fix_errors import (
     follow_calm_error,
-    reset_scatter,
     forget_spread,
     note_claims,
     propagate_walk,
+    reset_scatter,
     update_shares,
 )
 from eskf_ros.filter.integrity.heading_corrections import HEADING, forget_corrections, weigh_correction
@@ -43,6 +44,7 @@ from eskf_ros.filter.measurements.kalman_update import apply, judge, project, up
 from eskf_ros.filter.state.enums import Stream, Verdict
 from eskf_ros.filter.state.lanes import FILTER, HUMBLE, is_running
 from eskf_ros.filter.state.streams import is_live
+from eskf_ros.filter.state.time import NEVER
 
 SAME_SOLUTION = 4.0
 """Largest ratio of the variances of two consecutive fixes of the same kind of solution."""
@@ -87,6 +89,7 @@ def fuse_receiver(states, aid, gate, settings, work):
     elif aid.nis <= gate:
         apply(state, size, work)
         aid.verdict = Verdict.FUSED
+        confirm_given_heading(state)
     elif jumps:
         aid.verdict = Verdict.CONTRADICTED if is_contradicted(state, aid) else Verdict.GATE
     elif heard or aid.nis <= JUMP_GATE:
@@ -134,7 +137,12 @@ def judge_with_humble_lane(states, aid, gate, settings, work):
         propagate_walk(state, humble, aid.source)
     copy_scatter(state, humble, aid.source)
     jumps, believed, nis, log_determinant = hear(states, aid, gate, settings, work)
-    if believed == IMU_ASTRAY:
+    if believed == IMU_ASTRAY and state.heading.given_stamp != NEVER:
+        reset_to_unknown_heading(state)
+        humble.heading_known = 0
+        linearize(state, aid, settings, work)
+        reset_to_message(state, state.trust, aid, True, work)
+    elif believed == IMU_ASTRAY:
         reset_to_humble_lane(states)
     elif believed == RECEIVER_STEPPED:
         linearize(state, aid, settings, work)
