@@ -78,7 +78,10 @@ setup(
         ],
         # The World Magnetic Model, for the declination that a magnetometer needs; MIT, 0.3 MB, without dependencies.
         "mag": ["pygeomag"],
+        # Fleets of recordings on a Dask cluster (--dask); processes of one machine (--jobs) need nothing.
+        "dask": ["distributed"],
         "test": [
+            "distributed",
             "gtsam",
             "hypothesis",
             "matplotlib",  # examples/compare_configurations.py draws a plot

@@ -9,20 +9,25 @@ import argparse
 import json
 import math
 import os
-import signal
 import sys
 import time
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
+
+from eskf_ros.fleet.command import add_options, is_fleet
+from eskf_ros.fleet.stopping import Stopped, stoppable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from rich.table import Table
 
+    from eskf_ros.fleet.recordings import Found
     from eskf_ros.parameters.tree import Parameters
+    from eskf_ros.replay.run import Options
 
 _EPILOG = """\
 results, in DIR/<bag name>_eskf/ (files of an earlier replay are replaced):
@@ -31,31 +36,14 @@ results, in DIR/<bag name>_eskf/ (files of an earlier replay are replaced):
   aids.csv        one line per GNSS message or signal: stamp, arrival, aid, innovation, NIS, degrees of freedom, verdict
   summary.json    everything in numbers
 
-A rosbag2 directory is one recording; several arguments are replayed one after the other.
+A rosbag2 directory is one recording; several arguments are replayed one after the other. A folder of recordings, or
+--jobs or --dask, makes a fleet: what is finished and unchanged is skipped, and DIR/fleet.json has a row for each.
 ROS 1 bags: `rosbags-convert --src IN.bag --dst OUT` makes a ROS 2 bag of one.
 """
 
 
 class _Mistake(Exception):
     """A mistake of the user; the text is one line."""
-
-
-class _Stopped(BaseException):
-    """Ctrl-C or `kill`.
-
-    It is not KeyboardInterrupt: one that passes through an import of a dataclass makes Python die of SIGINT although it
-    is caught.
-    """
-
-    def __init__(self, number: int) -> None:
-        self.number = number
-
-
-_STOPPING = (signal.SIGINT, signal.SIGTERM)
-
-
-def _stop(number: int, frame: object) -> NoReturn:
-    raise _Stopped(number)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -99,7 +87,9 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 directory, .mcap or .db3 file")
+    parser.add_argument(
+        "bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 directory, .mcap or .db3 file, or a folder of such"
+    )
     parser.add_argument(
         "--config", type=Path, metavar="FILE", help="parameter file of the node (default: the defaults)"
     )
@@ -165,27 +155,25 @@ def _parser() -> argparse.ArgumentParser:
         "--json", metavar="FILE", help="write the summary here too; - is stdout, tables go to stderr then"
     )
     parser.add_argument("--quiet", action="store_true", help="no progress and no table; warnings and errors only")
+    add_options(parser)
     return parser
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return the exit code: 0, 2 for a mistake of the user, 130 after Ctrl-C, 143 after `kill`."""
-    previous = [signal.signal(number, _stop) for number in _STOPPING]
     try:
-        return _run(_parser().parse_args(arguments))
+        with stoppable():
+            return _run(_parser().parse_args(arguments))
     except _Mistake as mistake:
         _say(f"error: {mistake}")
         return 2
-    except _Stopped as stopped:
+    except Stopped as stopped:
         _say("interrupted; nothing is written for the recording in progress")
         return 128 + stopped.number
     except BrokenPipeError:
         # The reader of stdout has gone, as in `eskf_replay ... | head`.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    finally:
-        for number, handler in zip(_STOPPING, previous, strict=True):
-            signal.signal(number, handler)
 
 
 def _say(text: str) -> None:
@@ -193,13 +181,17 @@ def _say(text: str) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    from eskf_ros.fleet.recordings import find
     from eskf_ros.parameters.ros_yaml import load
     from eskf_ros.parameters.schema import ParameterError
     from eskf_ros.parameters.tree import Parameters
 
-    folders = [_folder(bag, options.out) for bag in options.bags]
-    for folder in folders:
-        if folders.count(folder) > 1:
+    found = find(options.bags, _say)
+    if not found:
+        raise _Mistake("there is nothing to replay")
+    folders = [recording.results(options.out) for recording in found]
+    for folder, count in Counter(folders).items():
+        if count > 1:
             raise _Mistake(
                 f"two of the recordings would write to {folder}; replay them one by one with different --out"
             )
@@ -208,6 +200,8 @@ def _run(options: argparse.Namespace) -> int:
     except ParameterError as error:
         raise _Mistake("; ".join(str(error).splitlines())) from error
 
+    if is_fleet(found, options):
+        return _replay_fleet(found, parameters, options)
     summaries: list[dict[str, Any]] = []
     for bag, folder in zip(options.bags, folders, strict=True):
         try:
@@ -219,30 +213,14 @@ def _run(options: argparse.Namespace) -> int:
     return 0 if len(summaries) == len(options.bags) else 2
 
 
-def _folder(bag: Path, out: Path | None) -> Path:
-    whole = bag.resolve()
-    name = whole.stem if whole.suffix in (".mcap", ".db3") else whole.name
-    return (out or whole.parent) / f"{name}_eskf"
-
-
 def _replay(bag: Path, folder: Path, parameters: Parameters, options: argparse.Namespace) -> dict[str, Any]:
     """Replay one recording and show the result; raises _Mistake."""
     started = time.perf_counter()
     from eskf_ros.bags import BagError
-    from eskf_ros.replay.run import Options, replay
+    from eskf_ros.replay.run import replay
     from eskf_ros.replay.topics import InputError
 
-    wanted = Options(
-        folder=folder,
-        truth=options.truth,
-        outages=tuple(options.outage),
-        mode=options.mode,
-        order=options.order,
-        output_rate=options.output_rate,
-        ranges=options.ranges,
-        navigation=tuple(options.nav),
-        clock_offset=options.clock_offset,
-    )
+    wanted = _wanted(folder, options)
     try:
         with _progress(bag, options.quiet) as progress:
             summary = replay(bag, parameters, wanted, progress, started)
@@ -255,6 +233,36 @@ def _replay(bag: Path, folder: Path, parameters: Parameters, options: argparse.N
     for warning in summary["warnings"]:
         _say(f"warning: {warning}")
     return summary
+
+
+def _wanted(folder: Path, options: argparse.Namespace) -> Options:
+    from eskf_ros.replay.run import Options
+
+    return Options(
+        folder=folder,
+        truth=options.truth,
+        outages=tuple(options.outage),
+        mode=options.mode,
+        order=options.order,
+        output_rate=options.output_rate,
+        ranges=options.ranges,
+        navigation=tuple(options.nav),
+        clock_offset=options.clock_offset,
+    )
+
+
+def _replay_fleet(found: Sequence[Found], parameters: Parameters, options: argparse.Namespace) -> int:
+    """Replay many recordings and show one table; raises _Mistake."""
+    from eskf_ros.fleet.dask_cluster import ClusterError
+    from eskf_ros.replay.fleet import replay_fleet
+
+    try:
+        content = replay_fleet(found, parameters, _wanted(Path(), options), options, _say)
+    except (ClusterError, OSError) as error:
+        raise _Mistake(str(error)) from error
+    if options.json:
+        _write_json(options.json, content)
+    return 2 if content["counts"]["failed"] else 0
 
 
 @contextmanager
