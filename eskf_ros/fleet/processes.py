@@ -19,7 +19,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import NoReturn
 
-from eskf_ros.fleet.task import Backend, Job, Outcome, Task, attempt
+from eskf_ros.fleet.task import Backend, Job, Outcome, Progress, Task, attempt
 
 ATTEMPTS = 2
 """How often a task is begun: a worker may die of what its neighbours do, e.g. for memory; twice speaks for the task."""
@@ -42,6 +42,16 @@ def _stop(number: int, frame: object) -> NoReturn:
 def _serve(pipe: Connection, job: Job) -> None:
     """Life of a worker: tasks in, progress and outcomes out, until the parent closes the pipe or dies."""
     signal.signal(signal.SIGTERM, _stop)
+    try:
+        while True:
+            task = pipe.recv()
+            pipe.send(attempt(job, task, _reporter(pipe), f"process {os.getpid()}"))
+    except (EOFError, OSError, _Told):
+        return
+
+
+def _reporter(pipe: Connection) -> Progress:
+    """Return what sends the progress of one task: at once when it begins, then not more often than can be seen."""
     told = 0.0
 
     def report(share: float) -> None:
@@ -51,11 +61,7 @@ def _serve(pipe: Connection, job: Job) -> None:
             told = now
             pipe.send(share)
 
-    try:
-        while True:
-            pipe.send(attempt(job, pipe.recv(), report, f"process {os.getpid()}"))
-    except (EOFError, OSError, _Told):
-        return
+    return report
 
 
 class _Worker:

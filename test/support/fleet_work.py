@@ -27,9 +27,7 @@ def work(task: Task, progress: Progress) -> dict[str, Any]:
         raise ZeroDivisionError("a fault of the work")
     if name.startswith("deadly") or (name.startswith("unlucky") and begun == 1):
         os.kill(os.getpid(), signal.SIGKILL)
-    if name.startswith("slow"):
-        time.sleep(1.0)
-    if name.startswith("endless"):
+    if name.startswith("endless") or (name.startswith("patient") and begun == 1):
         while True:
             progress(0.5)
             time.sleep(0.01)
