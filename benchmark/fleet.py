@@ -54,10 +54,13 @@ WORKERS = (1, 2, 4, 8, 16, 32, 64)
 
 @dataclass(frozen=True)
 class Costs:
-    """Seconds: work of each recording, start of a worker, and what the command itself needs for a recording."""
+    """Seconds: work of each recording; of a worker its start and its first loading of machine code; of the command,
+    what it needs for a recording.
+    """
 
     work: tuple[float, ...]
     start: float
+    load: float
     command: float
 
 
@@ -82,7 +85,6 @@ def replay(folder: Path, jobs: int) -> dict[str, Any]:
 def speed(folder: Path, count: int) -> tuple[str, tuple[float, ...]]:
     """Table of one and of two processes, and the seconds of each recording."""
     fleet = links(folder / "copies", BAG, count)
-    replay(links(folder / "first", BAG, 1), 1)  # compiles
     runs = {jobs: replay(fleet, jobs) for jobs in (1, 2)}
     rows = []
     for jobs, run in runs.items():
@@ -93,7 +95,8 @@ def speed(folder: Path, count: int) -> tuple[str, tuple[float, ...]]:
     text += f"\nLoad of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores. "
     text += f"Wall time {runs[1]['wall_s'] / runs[2]['wall_s']:.2f} times as fast with two; "
     text += f"processor time {processor[0] / processor[1]:.3f} of one to two.\n"
-    share = processor[0] / count  # Processor time: the wall time of a busy machine is that of the others, too.
+    start = sum(start_costs())
+    share = (processor[0] - start) / count  # Processor time: the wall time of a busy machine is not ours alone.
     return text, (share,) * count
 
 
@@ -157,9 +160,14 @@ def command_cost(folder: Path, count: int = 2000) -> float:
     return (time.process_time() - began) / count
 
 
-def start_cost() -> float:
-    """Processor seconds until a worker has begun: a new Python, the imports, the machine code of a first recording."""
-    program = "from eskf_ros.filter.warm_up import compile_kernels; import eskf_ros.replay.run; compile_kernels()"
+def start_costs() -> tuple[float, float]:
+    """Processor seconds of a worker: Python and imports, and then the machine code of its first recording."""
+    imports = "import eskf_ros.replay.fleet, eskf_ros.filter.warm_up as warm_up"
+    first = _processor_seconds(imports)
+    return first, _processor_seconds(f"{imports}; warm_up.compile_kernels()") - first
+
+
+def _processor_seconds(program: str) -> float:
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run([sys.executable, "-c", program], check=True, cwd=CHECKOUT)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -169,9 +177,11 @@ def start_cost() -> float:
 def simulated(costs: Costs, workers: int) -> float:
     """Seconds until the last of the recordings is done.
 
-    The first worker starts alone, the others when it has begun. The command serves one worker at a time.
+    All workers start at once; the first loads machine code alone, the others when it has begun. The command serves one
+    worker at a time.
     """
-    free = [(costs.start if number == 0 else 2.0 * costs.start, number) for number in range(workers)]
+    begun = costs.start + costs.load
+    free = [(begun if number == 0 else begun + costs.load, number) for number in range(workers)]
     heapq.heapify(free)
     command_free = end = 0.0
     for seconds in sorted(costs.work, reverse=True):
@@ -187,7 +197,7 @@ def bottleneck(costs: Costs, workers: int) -> str:
     """What costs most of the time that an even share of the work does not explain."""
     now = simulated(costs, workers)
     gains = {
-        "start of the workers": now - simulated(replace(costs, start=0.0), workers),
+        "start of the workers": now - simulated(replace(costs, start=0.0, load=0.0), workers),
         "the command": now - simulated(replace(costs, command=0.0), workers),
         "the longest recording": now - simulated(_cut(costs, workers), workers),
     }
@@ -211,17 +221,20 @@ def scaling(fleets: Mapping[str, Costs]) -> str:
     return table(("fleet", *(str(workers) for workers in WORKERS), f"bottleneck at {WORKERS[-1]}"), rows)
 
 
-def fleets_of(start: float, command: float, per_second: float) -> dict[str, Costs]:
+def fleets_of(start: float, load: float, command: float, per_second: float) -> dict[str, Costs]:
     """Fleets to simulate, with seconds of work per second of recording."""
     random = np.random.default_rng(1)
     mixed = np.clip(random.lognormal(np.log(600.0), 1.2, 1000), 10.0, 8 * 3600.0)
     lengths = {
         "40 of 221 s": np.full(40, 221.0),
+        "40 of 10 min": np.full(40, 600.0),
         "1000 of 20 s": np.full(1000, 20.0),
         "1000 of 1 h": np.full(1000, 3600.0),
         "1000 mixed, 10 s to 8 h": mixed,
     }
-    return {name: Costs(tuple((per_second * length).tolist()), start, command) for name, length in lengths.items()}
+    return {
+        name: Costs(tuple((per_second * length).tolist()), start, load, command) for name, length in lengths.items()
+    }
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -234,16 +247,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parts = options.parts.split(",")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
+        replay(links(folder / "first", BAG, 2), 1)  # compiles
         if "speed" in parts or "scaling" in parts:
             text, work = speed(folder, options.copies)
             print(text)
         if "memory" in parts:
             print(memory(folder, options.short))
         if "scaling" in parts:
-            start, command = start_cost(), command_cost(folder)
-            print(f"A worker starts in {start:.2f} s; the command needs {1e3 * command:.2f} ms for a recording,")
+            (start, load), command = start_costs(), command_cost(folder)
+            print(f"A worker starts in {start:.2f} s and loads machine code for {load:.2f} s; the command needs")
+            print(f"{1e3 * command:.2f} ms for a recording,")
             print(f"a worker {1e3 * work[0] / 221.0:.2f} ms for a second of recording (processor time).\n")
-            print(scaling(fleets_of(start, command, work[0] / 221.0)))
+            print(scaling(fleets_of(start, load, command, work[0] / 221.0)))
     return 0
 
 

@@ -80,7 +80,7 @@ class _Worker:
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         theirs.close()
-        self.task: Task
+        self.task: Task | None = None
 
     def give(self, task: Task) -> None:
         """Hand out a task; if the process has died meanwhile, the end of the pipe tells."""
@@ -107,7 +107,7 @@ def _outcomes(job: Job, tasks: Sequence[Task], progress: Callable[[str, float], 
     waiting = deque(tasks)
     attempts: Counter[str] = Counter()
     workers: list[_Worker] = []
-    wanted = 1  # Until the first has begun: on a first start it compiles, and the others find what it has made.
+    begun = False
 
     def supply(worker: _Worker) -> None:
         """Give the next task, or let the worker go."""
@@ -120,22 +120,26 @@ def _outcomes(job: Job, tasks: Sequence[Task], progress: Callable[[str, float], 
 
     try:
         while waiting or workers:
-            while waiting and len(workers) < wanted:
+            while len(workers) < min(count, len(waiting) + sum(worker.task is not None for worker in workers)):
                 workers.append(_Worker(job))
-                supply(workers[-1])
+            # All start at once, but one begins: on a first start it compiles, and the others find what it has made.
+            idle = [worker for worker in workers if worker.task is None]
+            for worker in idle if begun else idle[: len(idle) - len(workers) + 1]:
+                supply(worker)
             for worker in _with_news(workers):
+                task = worker.task
                 try:
                     message = worker.pipe.recv()
                 except (EOFError, OSError):
                     workers.remove(worker)
                     worker.leave()
-                    if attempts[worker.task.name] < ATTEMPTS:
-                        waiting.appendleft(worker.task)
-                    else:
-                        yield _lost(worker.task, worker.process)
+                    if task is not None and attempts[task.name] < ATTEMPTS:
+                        waiting.appendleft(task)
+                    elif task is not None:
+                        yield _lost(task, worker.process)
                     continue
-                wanted = count
-                task = worker.task
+                assert task is not None
+                begun = True
                 if isinstance(message, Outcome):
                     supply(worker)
                     yield replace(message, attempts=attempts[task.name])
