@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ from eskf_ros.simulate.main import main as simulate_bag
 from eskf_ros.simulate.scenario import simulate
 from markdown_table import table
 from peers_export import export, write_tum
-from peers_sidereon import SECOND, Inputs, Run, run_loose
+from peers_sidereon import SECOND, Inputs, Run, gyro_bias_at_rest, run_loose
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENT = ROOT / "docs" / "peers.md"
@@ -54,7 +55,13 @@ HEADINGS = (
     "us per sample",
     "evo APE rms, m",
 )
+SIDEREON = (
+    ("sidereon loose EKF", "EKF", False),
+    ("sidereon loose UKF", "UKF", False),
+    ("sidereon loose EKF, gyro bias held at ours", "EKF", True),
+)
 NOT_RUN = (
+    ("sidereon tight", "its filter shares the system matrix that carries the gyro bias away (above)"),
     ("KF-GINS", "C++ source, no package; `kf-gins.yaml` and its two files are exported"),
     ("robot_localization, FusionCore", "C++ nodes of ROS 2, not on PyPI"),
 )
@@ -222,9 +229,9 @@ def compared_drive(drive: Drive, folder: Path) -> str:
     export(folder, inputs, ours.start, frame, drive.parameters)
     write_truth(folder, ours)
     rows = [scored("eskf_ros", ours.run, ours, drive, folder)]
-    for name, kind in (("sidereon loose EKF", "EKF"), ("sidereon loose UKF", "UKF")):
+    for name, kind, holds_gyro_bias in SIDEREON:
         try:
-            run = run_loose(inputs, ours.start, frame, drive.parameters, kind)
+            run = run_loose(inputs, ours.start, frame, drive.parameters, kind, holds_gyro_bias)
         except ImportError:
             rows.append([name, "not installed", *["-"] * (len(HEADINGS) - 2)])
             continue
@@ -234,6 +241,19 @@ def compared_drive(drive: Drive, folder: Path) -> str:
         rows.append(scored(name, run, ours, drive, folder))
     rows += [[name, f"not run: {why}", *["-"] * (len(HEADINGS) - 2)] for name, why in NOT_RUN]
     return f"### {drive.title}\n\n{table(HEADINGS, rows)}\n"
+
+
+def at_rest() -> str:
+    """What sidereon makes of a gyro bias at rest, as a sentence."""
+    try:
+        true, found, deviation = gyro_bias_at_rest()
+    except ImportError:
+        return "sidereon is not installed.\n"
+    version = metadata.version("sidereon")
+    return (
+        f"sidereon {version} at rest, without noise, fixes of 1 cm for a minute: a gyro bias of {true:g} rad/s is "
+        f"estimated as {found:.4f} +- {deviation:.6f} rad/s.\n"
+    )
 
 
 def our_drives(folder: Path) -> list[Drive]:
@@ -288,6 +308,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.bag:
         print("\n".join(texts))
         return 0
+    texts.insert(0, at_rest())
     document = DOCUMENT.read_text(encoding="utf-8")
     before, after = document.split(MARKERS[0])[0], document.split(MARKERS[1])[1]
     DOCUMENT.write_text(before + MARKERS[0] + "\n" + "\n".join(texts) + MARKERS[1] + after, encoding="utf-8")

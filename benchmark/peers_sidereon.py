@@ -21,6 +21,9 @@ SECOND = 1_000_000_000
 BIAS_TIME = 1e6
 """s; correlation time of the biases where these are Gauss-Markov: long, as ours walk at random and forget nothing."""
 
+HELD = 1e-9
+"""rad/s; standard deviation of a gyro bias that is to stay as it is."""
+
 SATELLITES = 10
 """Number of satellites that is told with a fix; NavSatFix does not have it."""
 
@@ -56,7 +59,9 @@ def imu_to_base(parameters: Parameters) -> Array:
     return np.asarray(Rotation.from_euler("xyz", parameters.imu.mount_rpy_deg, degrees=True).as_matrix())
 
 
-def _filter(sidereon: Any, kind: str, start: NDArray[Any], frame: MapFrame, parameters: Parameters) -> Any:
+def _filter(
+    sidereon: Any, kind: str, start: NDArray[Any], frame: MapFrame, parameters: Parameters, holds_gyro_bias: bool
+) -> Any:
     """A filter that starts from our own estimate at one row, with its covariance but for what correlates its parts."""
     turn = imu_to_base(parameters)
     base_to_ecef = frame.rotation_map_to_ecef @ _matrix(start["attitude_body_to_map"])
@@ -76,7 +81,7 @@ def _filter(sidereon: Any, kind: str, start: NDArray[Any], frame: MapFrame, para
     covariance[3:6, 3:6] = base_to_ecef @ start["twist_covariance"][:3, :3] @ base_to_ecef.T
     covariance[6:9, 6:9] = to_ecef @ start["pose_covariance"][3:, 3:] @ to_ecef.T
     covariance[9:12, 9:12] = np.diag(start["accel_bias_std"] ** 2)
-    covariance[12:, 12:] = np.diag(start["gyro_bias_std"] ** 2)
+    covariance[12:, 12:] = np.diag(np.square(HELD if holds_gyro_bias else start["gyro_bias_std"])) * np.eye(3)
     symmetric = 0.5 * (covariance + covariance.T)
     state = sidereon.InsFilterState.from_covariance(nominal, sidereon.ErrorStateLayout.FIFTEEN, symmetric)
     imu, lever = parameters.imu, turn.T @ np.subtract(parameters.gnss.lever_arm, parameters.imu.mount_position)
@@ -85,7 +90,7 @@ def _filter(sidereon: Any, kind: str, start: NDArray[Any], frame: MapFrame, para
         imu.accel_noise_density,
         imu.gyro_noise_density,
         imu.accel_bias_random_walk * walk,
-        imu.gyro_bias_random_walk * walk,
+        HELD if holds_gyro_bias else imu.gyro_bias_random_walk * walk,
         BIAS_TIME,
         BIAS_TIME,
     )
@@ -122,7 +127,14 @@ def _measurement(sidereon: Any, inputs: Inputs, index: int, seconds: float) -> A
     )
 
 
-def run_loose(inputs: Inputs, start: NDArray[Any], frame: MapFrame, parameters: Parameters, kind: str) -> Run:
+def run_loose(
+    inputs: Inputs,
+    start: NDArray[Any],
+    frame: MapFrame,
+    parameters: Parameters,
+    kind: str,
+    holds_gyro_bias: bool = False,
+) -> Run:
     """Run the loosely coupled filter (kind: EKF or UKF) from the row `start` of our estimate on.
 
     Fixes come at their own time: the readings are interpolated there, and an interval is cut in two.
@@ -144,7 +156,7 @@ def run_loose(inputs: Inputs, start: NDArray[Any], frame: MapFrame, parameters: 
         int(stamp): _measurement(sidereon, inputs, index, (int(stamp) - begin) / SECOND)
         for index, stamp in enumerate(inputs.fix_stamp)
     }
-    engine = _filter(sidereon, kind, start, frame, parameters)
+    engine = _filter(sidereon, kind, start, frame, parameters, holds_gyro_bias)
     states = []
     began = time.process_time()
     for index, stamp in enumerate(stamps[1:].tolist()):
@@ -177,3 +189,27 @@ def _rows(states: list[Any], stamps: NDArray[np.int64], frame: MapFrame, paramet
     rows["gyro_bias"] = [state.nominal.gyro_bias_rps for state in states]
     rows["pose_covariance"][:, 3:, 3:] = to_map @ covariance[:, 6:9, 6:9] @ to_map.T
     return rows
+
+
+def gyro_bias_at_rest(seconds: float = 60.0) -> tuple[float, float, float]:
+    """Return true gyro bias, what sidereon makes of it, and its standard deviation of that (rad/s, first axis).
+
+    An IMU without noise lies level and at rest, with a fix of 1 cm five times a second. The estimate starts at zero,
+    with a standard deviation of twice the bias.
+    """
+    import sidereon
+
+    frame, true = MapFrame((48.0, 11.0, 500.0)), 1e-3
+    turn, place = frame.rotation_map_to_ecef, frame.origin_ecef
+    force = (-frame.gravity_map(np.zeros((1, 3)))[0]).tolist()
+    rate = (frame.earth_rate_map + [true, 0.0, 0.0]).tolist()
+    covariance = np.diag(np.repeat([0.01, 0.01, 1e-3, 1e-6, 2e-3], 3) ** 2)
+    nominal = sidereon.NavState(0.0, place.tolist(), [0.0, 0.0, 0.0], turn)
+    state = sidereon.InsFilterState.from_covariance(nominal, sidereon.ErrorStateLayout.FIFTEEN, covariance)
+    engine = sidereon.InertialFilter(state, sidereon.ImuSpec(1e-3, 1e-5, 1e-6, 1e-7, BIAS_TIME, BIAS_TIME))
+    for step in range(1, round(20.0 * seconds) + 1):
+        engine.propagate(sidereon.ImuSample.rate(0.05 * step, force, rate))
+        if step % 4 == 0:
+            fix = sidereon.GnssFixMeasurement.position(0.05 * step, place.tolist(), 1e-4 * np.eye(3), SATELLITES)
+            engine.update_loose(fix)
+    return true, float(engine.state.nominal.gyro_bias_rps[0]), float(np.sqrt(engine.state.covariance[12, 12]))
