@@ -88,11 +88,6 @@ class _Worker:
         with contextlib.suppress(OSError):
             self.pipe.send(task)
 
-    def leave(self) -> None:
-        """Let the process end: it does when the pipe is closed."""
-        self.pipe.close()
-        self.process.join(PATIENCE)
-
 
 def on_processes(count: int) -> Backend:
     """Return a backend of up to `count` processes of this machine."""
@@ -107,7 +102,14 @@ def _outcomes(job: Job, tasks: Sequence[Task], progress: Callable[[str, float], 
     waiting = deque(tasks)
     attempts: Counter[str] = Counter()
     workers: list[_Worker] = []
+    leaving: list[_Worker] = []
     begun = False
+
+    def let_go(worker: _Worker) -> None:
+        """Let a process end: it does when its pipe is closed."""
+        worker.pipe.close()
+        workers.remove(worker)
+        leaving.append(worker)
 
     def supply(worker: _Worker) -> None:
         """Give the next task, or let the worker go."""
@@ -115,8 +117,7 @@ def _outcomes(job: Job, tasks: Sequence[Task], progress: Callable[[str, float], 
             attempts[waiting[0].name] += 1
             worker.give(waiting.popleft())
         else:
-            workers.remove(worker)
-            worker.leave()
+            let_go(worker)
 
     try:
         while waiting or workers:
@@ -131,8 +132,8 @@ def _outcomes(job: Job, tasks: Sequence[Task], progress: Callable[[str, float], 
                 try:
                     message = worker.pipe.recv()
                 except (EOFError, OSError):
-                    workers.remove(worker)
-                    worker.leave()
+                    let_go(worker)
+                    worker.process.join()
                     if task is not None and attempts[task.name] < ATTEMPTS:
                         waiting.appendleft(task)
                     elif task is not None:
@@ -146,7 +147,7 @@ def _outcomes(job: Job, tasks: Sequence[Task], progress: Callable[[str, float], 
                 else:
                     progress(task.name, message)
     finally:
-        _end(workers)
+        _end(workers, leaving)
 
 
 def _with_news(workers: Sequence[_Worker]) -> list[_Worker]:
@@ -163,12 +164,12 @@ def _lost(task: Task, process: SpawnProcess) -> Outcome:
     return Outcome(task, "failed", error=error, attempts=ATTEMPTS, worker=f"process {process.pid}")
 
 
-def _end(workers: Sequence[_Worker]) -> None:
-    """Stop what still works; unfinished files are removed by the workers themselves."""
+def _end(workers: Sequence[_Worker], leaving: Sequence[_Worker]) -> None:
+    """Stop what still works, and wait for all; unfinished files are removed by the workers themselves."""
     for worker in workers:
         worker.process.terminate()
     deadline = time.monotonic() + PATIENCE
-    for worker in workers:
+    for worker in (*workers, *leaving):
         worker.process.join(max(0.0, deadline - time.monotonic()))
         if worker.process.is_alive():
             worker.process.kill()
