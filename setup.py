@@ -83,8 +83,11 @@ setup(
         "mag": ["pygeomag"],
         # The page of eskf_report, on the computer where results are looked at: BSD, draws without a network.
         "report": ["bokeh>=3.4"],
+        # Fleets of recordings on a Dask cluster (--dask); processes of one machine (--jobs) need nothing.
+        "dask": ["distributed"],
         "test": [
             "bokeh>=3.4",
+            "distributed",
             "gtsam",
             "hypothesis",
             "matplotlib",  # examples/compare_configurations.py draws a plot

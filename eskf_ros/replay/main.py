@@ -7,191 +7,44 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
-import signal
 import sys
 import time
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
+
+from eskf_ros.fleet.command import is_fleet
+from eskf_ros.fleet.stopping import Stopped, stoppable
+from eskf_ros.replay.arguments import Mistake, parser
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from rich.table import Table
 
+    from eskf_ros.fleet.recordings import Found
     from eskf_ros.parameters.tree import Parameters
-
-_EPILOG = """\
-results, in DIR/<bag name>_eskf/ (files of an earlier replay are replaced):
-  odometry.mcap   odometry, fixes, verdicts, biases, diagnostics, path and truth, for Foxglove and others
-  trajectory.tum  t x y z qx qy qz qw: base_link in map as it was published at that time, from the first known position
-  aids.csv        one line per GNSS message or signal: stamp, arrival, aid, innovation, NIS, degrees of freedom, verdict
-  details.npz     what only a report needs: biases, states, errors, fixes and the IMU by the second
-  summary.json    everything in numbers
-  report.html     with --report: all of it as a page for a browser (eskf_report makes one of several results)
-
-A rosbag2 directory is one recording; several arguments are replayed one after the other.
-ROS 1 bags: `rosbags-convert --src IN.bag --dst OUT` makes a ROS 2 bag of one.
-"""
-
-
-class _Mistake(Exception):
-    """A mistake of the user; the text is one line."""
-
-
-class _Stopped(BaseException):
-    """Ctrl-C or `kill`.
-
-    It is not KeyboardInterrupt: one that passes through an import of a dataclass makes Python die of SIGINT although it
-    is caught.
-    """
-
-    def __init__(self, number: int) -> None:
-        self.number = number
-
-
-_STOPPING = (signal.SIGINT, signal.SIGTERM)
-
-
-def _stop(number: int, frame: object) -> NoReturn:
-    raise _Stopped(number)
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise _Mistake(f"{message} (eskf_replay --help explains)")
-
-
-def _outage(text: str) -> tuple[float, float]:
-    try:
-        start, length = (float(part) for part in text.split(":"))
-    except ValueError:
-        start = length = math.nan
-    if not (0.0 <= start < math.inf and 0.0 < length < math.inf):
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not START:LENGTH in seconds, START at least 0 and LENGTH above 0, as in 120:45"
-        )
-    return start, length
-
-
-def _rate(text: str) -> float:
-    try:
-        rate = float(text)
-    except ValueError:
-        rate = math.nan
-    if not (rate == 0.0 or 1e-3 <= rate <= 1e5):
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not a rate in Hz from 0.001 to 100000, or 0 for every IMU sample"
-        )
-    return rate
-
-
-def _parser() -> argparse.ArgumentParser:
-    """Open all that the node needs.
-
-    Over 60 lines: a list of options.
-    """
-    parser = _Parser(
-        prog="eskf_replay",
-        description="Runs recordings of an IMU and a GNSS receiver through the estimator of eskf_node.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 directory, .mcap or .db3 file")
-    parser.add_argument(
-        "--config", type=Path, metavar="FILE", help="parameter file of the node (default: the defaults)"
-    )
-    parser.add_argument(
-        "--profile", default="", metavar="NAME", help="parameters for a kind of robot, below those of --config"
-    )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="where the results go (default: next to the bag)")
-    parser.add_argument(
-        "--truth",
-        default="",
-        metavar="TOPIC",
-        help="compare with this topic: nav_msgs/Odometry of base_link in frame earth (ECEF), or in the map frame when "
-        "datum is configured, or NavSatFix of the antenna",
-    )
-    parser.add_argument(
-        "--outage",
-        action="append",
-        default=[],
-        type=_outage,
-        metavar="START:LENGTH",
-        help="withhold GNSS for LENGTH seconds, START seconds after the first IMU stamp; can be given several times",
-    )
-    parser.add_argument(
-        "--mode",
-        choices=("loose", "tight", "ins-only"),
-        default="",
-        help="loose: the receiver's fixes; tight: range and Doppler of each satellite; ins-only: GNSS until the state "
-        "is GOOD, then none (default: the parameter mode; tight with --ranges)",
-    )
-    parser.add_argument(
-        "--ranges",
-        type=Path,
-        metavar="FILE.obs",
-        help="RINEX observation file with the pseudoranges and Doppler of the drive, in place of the topic gnss/ranges",
-    )
-    parser.add_argument(
-        "--nav",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="FILE.nav",
-        help="RINEX navigation file with the orbits of the satellites; can be given several times (default: the "
-        "parameter ranges.rinex_nav_files)",
-    )
-    parser.add_argument(
-        "--clock-offset",
-        type=float,
-        default=0.0,
-        metavar="S",
-        help="with --ranges: seconds by which the stamps of the recording are ahead of UTC (GPS time: 18)",
-    )
-    parser.add_argument(
-        "--order",
-        choices=("log", "stamp"),
-        default="log",
-        help="give messages as they were recorded, or sorted by stamp within 10 s (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--output-rate",
-        type=_rate,
-        default=50.0,
-        metavar="HZ",
-        help="rate of trajectory.tum and odometry.mcap; 0: every IMU sample (default: %(default)g)",
-    )
-    parser.add_argument(
-        "--json", metavar="FILE", help="write the summary here too; - is stdout, tables go to stderr then"
-    )
-    parser.add_argument("--report", action="store_true", help="make report.html, too (needs the package bokeh)")
-    parser.add_argument("--quiet", action="store_true", help="no progress and no table; warnings and errors only")
-    return parser
+    from eskf_ros.replay.run import Options
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return the exit code: 0, 2 for a mistake of the user, 130 after Ctrl-C, 143 after `kill`."""
-    previous = [signal.signal(number, _stop) for number in _STOPPING]
     try:
-        return _run(_parser().parse_args(arguments))
-    except _Mistake as mistake:
+        with stoppable():
+            return _run(parser().parse_args(arguments))
+    except Mistake as mistake:
         _say(f"error: {mistake}")
         return 2
-    except _Stopped as stopped:
+    except Stopped as stopped:
         _say("interrupted; nothing is written for the recording in progress")
         return 128 + stopped.number
     except BrokenPipeError:
         # The reader of stdout has gone, as in `eskf_replay ... | head`.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    finally:
-        for number, handler in zip(_STOPPING, previous, strict=True):
-            signal.signal(number, handler)
 
 
 def _say(text: str) -> None:
@@ -199,6 +52,7 @@ def _say(text: str) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    from eskf_ros.fleet.recordings import find
     from eskf_ros.parameters.ros_yaml import load
     from eskf_ros.parameters.schema import ParameterError
 
@@ -206,43 +60,75 @@ def _run(options: argparse.Namespace) -> int:
         from eskf_ros.report.main import MISSING, is_available
 
         if not is_available():
-            raise _Mistake(MISSING)
-    folders = [_folder(bag, options.out) for bag in options.bags]
-    for folder in folders:
-        if folders.count(folder) > 1:
-            raise _Mistake(
-                f"two of the recordings would write to {folder}; replay them one by one with different --out"
-            )
+            raise Mistake(MISSING)
+    found = find(options.bags, _say)
+    if not found:
+        raise Mistake("there is nothing to replay")
+    folders = [recording.results(options.out) for recording in found]
+    for folder, count in Counter(folders).items():
+        if count > 1:
+            raise Mistake(f"two of the recordings would write to {folder}; replay them one by one with different --out")
     try:
         parameters = load(options.config, profile=options.profile)
     except ParameterError as error:
-        raise _Mistake("; ".join(str(error).splitlines())) from error
+        raise Mistake("; ".join(str(error).splitlines())) from error
 
+    if is_fleet(found, options):
+        code = _replay_fleet(found, parameters, options)
+        for folder in folders if options.report else ():
+            if (folder / "summary.json").is_file():
+                _report(folder)
+        return code
     summaries: list[dict[str, Any]] = []
     for bag, folder in zip(options.bags, folders, strict=True):
         try:
             summaries.append(_replay(bag, folder, parameters, options))
-        except _Mistake as mistake:
+        except Mistake as mistake:
             _say(f"error: {mistake}")
     if options.json:
         _write_json(options.json, summaries[0] if len(options.bags) == 1 and summaries else summaries)
     return 0 if len(summaries) == len(options.bags) else 2
 
 
-def _folder(bag: Path, out: Path | None) -> Path:
-    whole = bag.resolve()
-    name = whole.stem if whole.suffix in (".mcap", ".db3") else whole.name
-    return (out or whole.parent) / f"{name}_eskf"
-
-
 def _replay(bag: Path, folder: Path, parameters: Parameters, options: argparse.Namespace) -> dict[str, Any]:
-    """Replay one recording and show the result; raises _Mistake."""
+    """Replay one recording and show the result; raises Mistake."""
     started = time.perf_counter()
     from eskf_ros.bags import BagError
-    from eskf_ros.replay.run import Options, replay
+    from eskf_ros.replay.run import replay
     from eskf_ros.replay.topics import InputError
 
-    wanted = Options(
+    wanted = _wanted(folder, options)
+    try:
+        with _progress(bag, options.quiet) as progress:
+            summary = replay(bag, parameters, wanted, progress, started)
+    except (BagError, InputError) as error:
+        raise Mistake(str(error)) from error
+    except OSError as error:
+        raise Mistake(f"{error.filename or folder}: {error.strerror or error}") from error
+    report = _report(folder) if options.report else None
+    if not options.quiet:
+        _show(summary, folder, report, to_stderr=options.json == "-")
+    for warning in summary["warnings"]:
+        _say(f"warning: {warning}")
+    return summary
+
+
+def _report(folder: Path) -> Path:
+    """Make the page of a result and return where it is; raises Mistake."""
+    from eskf_ros.report.main import NAME, write_report
+    from eskf_ros.report.read import ReportError
+
+    try:
+        write_report([folder], folder / NAME)
+    except ReportError as error:
+        raise Mistake(str(error)) from error
+    return folder / NAME
+
+
+def _wanted(folder: Path, options: argparse.Namespace) -> Options:
+    from eskf_ros.replay.run import Options
+
+    return Options(
         folder=folder,
         truth=options.truth,
         outages=tuple(options.outage),
@@ -253,31 +139,20 @@ def _replay(bag: Path, folder: Path, parameters: Parameters, options: argparse.N
         navigation=tuple(options.nav),
         clock_offset=options.clock_offset,
     )
-    try:
-        with _progress(bag, options.quiet) as progress:
-            summary = replay(bag, parameters, wanted, progress, started)
-    except (BagError, InputError) as error:
-        raise _Mistake(str(error)) from error
-    except OSError as error:
-        raise _Mistake(f"{error.filename or folder}: {error.strerror or error}") from error
-    report = _report(folder) if options.report else None
-    if not options.quiet:
-        _show(summary, folder, report, to_stderr=options.json == "-")
-    for warning in summary["warnings"]:
-        _say(f"warning: {warning}")
-    return summary
 
 
-def _report(folder: Path) -> Path:
-    """Make the page of a result and return where it is; raises _Mistake."""
-    from eskf_ros.report.main import NAME, write_report
-    from eskf_ros.report.read import ReportError
+def _replay_fleet(found: Sequence[Found], parameters: Parameters, options: argparse.Namespace) -> int:
+    """Replay many recordings and show one table; raises Mistake."""
+    from eskf_ros.fleet.dask_cluster import ClusterError
+    from eskf_ros.replay.fleet import replay_fleet
 
     try:
-        write_report([folder], folder / NAME)
-    except ReportError as error:
-        raise _Mistake(str(error)) from error
-    return folder / NAME
+        content = replay_fleet(found, parameters, _wanted(Path(), options), options, _say)
+    except (ClusterError, OSError) as error:
+        raise Mistake(str(error)) from error
+    if options.json:
+        _write_json(options.json, content)
+    return 2 if content["counts"]["failed"] else 0
 
 
 @contextmanager
@@ -311,7 +186,7 @@ def _write_json(target: str, content: Any) -> None:
     try:
         Path(target).write_text(text, encoding="utf-8")
     except OSError as error:
-        raise _Mistake(f"--json {target}: {error.strerror or error}") from error
+        raise Mistake(f"--json {target}: {error.strerror or error}") from error
 
 
 def _show(summary: dict[str, Any], folder: Path, report: Path | None, to_stderr: bool) -> None:

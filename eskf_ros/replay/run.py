@@ -16,10 +16,13 @@ from eskf_ros.bags import BagReader, Batch, open_bag
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.output.global_odometry import ODOMETRY
 from eskf_ros.filter.state.enums import Stream
+from eskf_ros.fleet import fingerprint
+from eskf_ros.fleet.recordings import files_of
 from eskf_ros.gnss.rinex import RinexError
 from eskf_ros.inputs.epochs import RangeIntake
 from eskf_ros.inputs.rinex_as_messages import RangesError, merged, read_beside
 from eskf_ros.inputs.table import FIX
+from eskf_ros.parameters.mapping import to_mapping
 from eskf_ros.parameters.tree import Parameters
 from eskf_ros.replay.details import Details
 from eskf_ros.replay.feed import Feed
@@ -88,6 +91,7 @@ def replay(
     Over 60 lines: the loop of the replay with its results.
     """
     clock = StageClock(time.perf_counter() if started is None else started)
+    marks = fingerprint_of(bag, parameters, options)
     parameters = with_options(parameters, options)
     with open_bag([bag]) as reader:
         topics, hints = find_topics(reader, bag, parameters, options.truth, options.ranges is not None)
@@ -136,6 +140,7 @@ def replay(
             clock.lap("details")
             result = {
                 "bag": str(bag),
+                "fingerprint": marks,
                 "mode": options.mode or parameters.mode,
                 "order": options.order,
                 **summary.result(navigator, clock.total()),
@@ -152,6 +157,19 @@ def replay(
             }
             files.write_summary(result)
     return result
+
+
+def fingerprint_of(bag: Path, parameters: Parameters, options: Options) -> dict[str, str]:
+    """Return what a result is of, as short texts: recording (and files beside it), configuration, version."""
+    beside = [*options.navigation, *(Path(name) for name in parameters.ranges.rinex_nav_files.split(":") if name)]
+    if options.ranges is not None:
+        beside.append(options.ranges)
+    chosen = {key: value for key, value in dataclasses.asdict(options).items() if key != "folder"}
+    return {
+        "recording": fingerprint.of_files([*files_of(bag), *beside]),
+        "configuration": fingerprint.of_values({"options": chosen, "parameters": to_mapping(parameters)}),
+        "version": fingerprint.of_version(),
+    }
 
 
 def with_options(parameters: Parameters, options: Options) -> Parameters:

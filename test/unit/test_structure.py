@@ -17,7 +17,7 @@ FLOORS = (
     ("compiled", "parameters.schema"),
     ("geodesy",),
     ("gnss",),
-    ("bags",),
+    ("bags", "fleet"),
     ("filter.state",),
     ("filter.history",),
     ("filter.inertial",),
