@@ -38,13 +38,14 @@ FLOORS = (
     ("replay", "simulate"),
     ("tables", "doctor"),
     ("api",),
+    ("calibrate",),
     ("ros_node",),
 )
 """From the lowest floor to the highest: a room imports from floors below it, and from itself."""
 
 WRITERS = {
     "alignment/first_fix.py": {"reset_position_to_fix", "reset_pose"},
-    "alignment/heading.py": {"reset_heading"},
+    "alignment/heading.py": {"inflate_position", "reset_heading"},
     "alignment/heading_sensors.py": {"reset_given_heading"},
     "alignment/levelling.py": {"reset_tilt", "update_gyro_bias_at_rest", "reset_level_to_moving"},
     "inertial/covariance.py": {"propagate_noise", "propagate_axis_noise", "propagate_covariance", "update_error_axes"},
@@ -55,7 +56,7 @@ WRITERS = {
     "integrity/scatter.py": {"inflate_lasting_error"},
     "measurements/kalman_update.py": {"update_covariance", "update_nominal_state"},
     "measurements/mag.py": {"propagate_mag_error"},
-    "state/augmented_states.py": {"reset_augmented", "propagate_augmented", "propagate_clock"},
+    "state/augmented_states.py": {"reset_augmented", "propagate_augmented", "propagate_clock", "propagate_scale"},
     "tight/epoch.py": {"inflate_or_reset_by_majority"},
     "tight/receiver_clock.py": {"reset_clock", "reset_or_jump_clock"},
 }
