@@ -78,7 +78,10 @@ setup(
         ],
         # The World Magnetic Model, for the declination that a magnetometer needs; MIT, 0.3 MB, without dependencies.
         "mag": ["pygeomag"],
+        # eskf_calibrate --static: the Allan deviation, and its plot; LGPL-3.0, pure Python.
+        "calibrate": ["allantools", "matplotlib"],
         "test": [
+            "allantools",
             "gtsam",
             "hypothesis",
             "matplotlib",  # examples/compare_configurations.py draws a plot
@@ -99,6 +102,7 @@ setup(
             "eskf_node = eskf_ros.ros_node.main:main",
             "eskf_replay = eskf_ros.replay.main:main",
             "eskf_check = eskf_ros.doctor.main:main",
+            "eskf_calibrate = eskf_ros.calibrate.main:main",
             "eskf_ranges = eskf_ros.inputs.ranges_command:main",
             "eskf_simulate = eskf_ros.simulate.main:main",
         ],
