@@ -102,7 +102,7 @@ setup(
             "eskf_node = eskf_ros.ros_node.main:main",
             "eskf_replay = eskf_ros.replay.main:main",
             "eskf_check = eskf_ros.doctor.main:main",
-            "eskf_calibrate = eskf_ros.calibrate.main:main",
+            "eskf_calibrate = eskf_ros.calibration.main:main",
             "eskf_ranges = eskf_ros.inputs.ranges_command:main",
             "eskf_simulate = eskf_ros.simulate.main:main",
         ],

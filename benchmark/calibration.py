@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.calibrate.calibration import calibrate
+from eskf_ros.calibration.calibrate import calibrate
 from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.scenario import Recording, simulate
 from eskf_ros.simulate.wheel import WheelOdometer

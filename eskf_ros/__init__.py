@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from eskf_ros.api import Filter, Result, run
-    from eskf_ros.calibrate.calibration import calibrate
+    from eskf_ros.calibration.calibrate import calibrate
     from eskf_ros.doctor.examine import check
     from eskf_ros.parameters.ros_yaml import load as load_parameters
     from eskf_ros.tables.bag import read_bag
@@ -24,7 +24,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "Filter": "eskf_ros.api.Filter",
     "Result": "eskf_ros.api.Result",
-    "calibrate": "eskf_ros.calibrate.calibration.calibrate",
+    "calibrate": "eskf_ros.calibration.calibrate.calibrate",
     "check": "eskf_ros.doctor.examine.check",
     "run": "eskf_ros.api.run",
     "load_parameters": "eskf_ros.parameters.ros_yaml.load",

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 
 import eskf_ros
 from calibration import tables_of
-from eskf_ros.calibrate.calibration import calibrate
-from eskf_ros.calibrate.findings import Calibration
-from eskf_ros.calibrate.main import main
+from eskf_ros.calibration.calibrate import calibrate
+from eskf_ros.calibration.findings import Calibration
+from eskf_ros.calibration.main import main
 from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.parameters.ros_yaml import load
 from eskf_ros.simulate.main import main as simulate_bag

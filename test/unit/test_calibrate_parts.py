@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calibration import tables_of
-from eskf_ros.calibrate.coarse_mounting import coarse_mounting
-from eskf_ros.calibrate.combine import combine
-from eskf_ros.calibrate.constants import CONSTANTS, as_states, changed, constants_of, places_of
-from eskf_ros.calibrate.findings import Calibration, Finding, findings_of
-from eskf_ros.calibrate.noise import rest_and_road
-from eskf_ros.calibrate.recording import Pass
-from eskf_ros.calibrate.report import parameter_file
-from eskf_ros.calibrate.roll import ROW_RATE, Roll, roll_of
+from eskf_ros.calibration.coarse_mounting import coarse_mounting
+from eskf_ros.calibration.combine import combine
+from eskf_ros.calibration.constants import CONSTANTS, as_states, changed, constants_of, places_of
+from eskf_ros.calibration.findings import Calibration, Finding, findings_of
+from eskf_ros.calibration.noise import rest_and_road
+from eskf_ros.calibration.recording import Pass
+from eskf_ros.calibration.report import parameter_file
+from eskf_ros.calibration.roll import ROW_RATE, Roll, roll_of
 from eskf_ros.filter.output.global_odometry import ODOMETRY
 from eskf_ros.filter.state.error_state import ERROR_SIZE
 from eskf_ros.parameters.mapping import from_mapping, to_mapping
@@ -166,8 +166,7 @@ def judged(covariance: Array) -> dict[str, Finding]:
     combined = combine([one], np.zeros(3), prior_std)
     current = changed(Parameters(), {"lever_arm_x": 0.5})
     return {
-        finding.name: finding
-        for finding in findings_of(constants, Parameters(), current, combined, [one], np.zeros(3))
+        finding.name: finding for finding in findings_of(constants, Parameters(), current, combined, [one], np.zeros(3))
     }
 
 
@@ -215,7 +214,7 @@ def test_all_refused_is_still_a_file_the_node_takes(tmp_path: Path) -> None:
 
 def test_allan_deviation_finds_noise_and_random_walk() -> None:
     pytest.importorskip("allantools")
-    from eskf_ros.calibrate.static import parameters_of, static_noise
+    from eskf_ros.calibration.static import parameters_of, static_noise
 
     rng, rate, seconds = np.random.default_rng(1), 50.0, 7200
     count = int(rate * seconds)
@@ -235,7 +234,7 @@ def test_allan_deviation_finds_noise_and_random_walk() -> None:
 
 def test_an_imu_that_was_touched_is_told() -> None:
     pytest.importorskip("allantools")
-    from eskf_ros.calibrate.static import static_noise
+    from eskf_ros.calibration.static import static_noise
 
     rng = np.random.default_rng(2)
     readings = rng.normal(size=(6000, 6))

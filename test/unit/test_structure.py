@@ -38,7 +38,7 @@ FLOORS = (
     ("replay", "simulate"),
     ("tables", "doctor"),
     ("api",),
-    ("calibrate",),
+    ("calibration",),
     ("ros_node",),
 )
 """From the lowest floor to the highest: a room imports from floors below it, and from itself."""

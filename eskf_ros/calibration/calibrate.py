@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from eskf_ros.calibrate.coarse_mounting import CoarseMounting, coarse_mounting
-from eskf_ros.calibrate.combine import Combined, combine
-from eskf_ros.calibrate.compare import figures_of
-from eskf_ros.calibrate.constants import (
+from eskf_ros.calibration.coarse_mounting import CoarseMounting, coarse_mounting
+from eskf_ros.calibration.combine import Combined, combine
+from eskf_ros.calibration.compare import figures_of
+from eskf_ros.calibration.constants import (
     CONSTANTS,
     Constant,
     as_states,
@@ -29,7 +29,7 @@ from eskf_ros.calibrate.constants import (
     rpy_deg,
     with_mounting,
 )
-from eskf_ros.calibrate.findings import (
+from eskf_ros.calibration.findings import (
     Calibration,
     findings_of,
     noise_findings,
@@ -37,8 +37,8 @@ from eskf_ros.calibrate.findings import (
     with_consequences,
     with_noise,
 )
-from eskf_ros.calibrate.recording import Pass, Recording, as_recording, run_pass
-from eskf_ros.calibrate.roll import Roll, weighed_mean
+from eskf_ros.calibration.recording import Pass, Recording, as_recording, run_pass
+from eskf_ros.calibration.roll import Roll, weighed_mean
 from eskf_ros.filter.measurements.row import to_base
 from eskf_ros.parameters.ros_yaml import load
 from eskf_ros.parameters.tree import Parameters

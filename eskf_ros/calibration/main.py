@@ -77,8 +77,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _calibrate(options: argparse.Namespace) -> int:
     from rich.console import Console
 
-    from eskf_ros.calibrate.calibration import calibrate
-    from eskf_ros.calibrate.report import as_dict, parameter_file, show
+    from eskf_ros.calibration.calibrate import calibrate
+    from eskf_ros.calibration.report import as_dict, parameter_file, show
 
     calibration = calibrate(
         options.bags,
@@ -102,7 +102,7 @@ def _static(options: argparse.Namespace) -> int:
     import numpy as np
 
     from eskf_ros.bags import open_bag
-    from eskf_ros.calibrate.static import draw, parameters_of, static_noise
+    from eskf_ros.calibration.static import draw, parameters_of, static_noise
     from eskf_ros.parameters.docs import yaml_value
     from eskf_ros.parameters.ros_yaml import load
     from eskf_ros.parameters.tree import Parameters

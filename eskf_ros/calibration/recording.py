@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.api import Filter
-from eskf_ros.calibrate.constants import Constant, places_of, prior_stds
-from eskf_ros.calibrate.roll import ROW_RATE, Roll, roll_of
+from eskf_ros.calibration.constants import Constant, places_of, prior_stds
+from eskf_ros.calibration.roll import ROW_RATE, Roll, roll_of
 from eskf_ros.filter.state.error_state import ERROR_SIZE
 from eskf_ros.parameters.tree import Parameters
 from eskf_ros.tables.bag import read_bag

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.calibrate.recording import Pass
+from eskf_ros.calibration.recording import Pass
 
 Array = NDArray[np.float64]
 

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from eskf_ros.calibrate.coarse_mounting import CoarseMounting
-from eskf_ros.calibrate.combine import Combined
-from eskf_ros.calibrate.constants import Constant, value_of
-from eskf_ros.calibrate.noise import rest_and_road
-from eskf_ros.calibrate.recording import Pass, Recording
-from eskf_ros.calibrate.roll import SHOWN_BY as ROLL_SHOWN_BY
-from eskf_ros.calibrate.roll import Roll
+from eskf_ros.calibration.coarse_mounting import CoarseMounting
+from eskf_ros.calibration.combine import Combined
+from eskf_ros.calibration.constants import Constant, value_of
+from eskf_ros.calibration.noise import rest_and_road
+from eskf_ros.calibration.recording import Pass, Recording
+from eskf_ros.calibration.roll import SHOWN_BY as ROLL_SHOWN_BY
+from eskf_ros.calibration.roll import Roll
 from eskf_ros.parameters.mapping import from_mapping, to_mapping
 from eskf_ros.parameters.tree import Parameters
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from eskf_ros.calibrate.recording import Recording, filtered, mean_nis
+from eskf_ros.calibration.recording import Recording, filtered, mean_nis
 from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.parameters.tree import Parameters
 from eskf_ros.replay.run import Options, replay

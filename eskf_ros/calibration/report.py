@@ -11,7 +11,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from eskf_ros.calibrate.findings import Calibration, Finding
+from eskf_ros.calibration.findings import Calibration, Finding
 from eskf_ros.parameters.docs import yaml_value
 from eskf_ros.parameters.mapping import leaves, to_mapping
 from eskf_ros.parameters.schema import Value
