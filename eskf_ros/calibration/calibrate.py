@@ -24,6 +24,7 @@ from eskf_ros.calibration.constants import (
     CONSTANTS,
     Constant,
     as_states,
+    begin_stds,
     changed,
     constants_of,
     rpy_deg,
@@ -49,11 +50,16 @@ Each = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 MOST_PASSES = 8
 """Passes after which the calibration ends although something still changes, with a warning."""
 
-SETTLED_SHARE = 0.1
+SETTLED_SHARE = 0.2
 """A constant has settled when a pass changes it by less than this share of its standard deviation."""
 
 SETTLED_ROLL = math.radians(0.02)
 """rad; the same of the roll of the mounting."""
+
+BEGIN_SIGMAS = 10.0
+"""From the second pass on a constant begins with this many of the sigmas of the pass before, at most with its prior:
+near the truth the filter is linear from the start. What a recording says is the same, whatever it began with.
+"""
 
 LARGEST_STEP = 3.0
 """A pass changes a constant by at most this many of its prior standard deviations."""
@@ -132,18 +138,21 @@ def iterate(
     current, moved = start, np.zeros(len(constants))
     prior_std = np.array([constant.prior_std for constant in constants])
     least = np.array([constant.least_std for constant in constants])
+    first_std = begin_stds(constants, prior_std)
     for number in range(1, MOST_PASSES + 1):
         say(f"pass {number}")
-        states = as_states(current, constants, is_vehicle)
-        passes = list(each(partial(run_pass, parameters=states, constants=constants), given))
+        states = as_states(current, constants, is_vehicle, first_std)
+        passes = list(each(partial(run_pass, parameters=states, constants=constants, first_std=first_std), given))
         combined = combine(passes, moved, prior_std)
+        std = np.maximum(np.sqrt(np.diag(combined.covariance)), least)
+        first_std = begin_stds(constants, np.minimum(prior_std, BEGIN_SIGMAS * std))
         step = np.clip(combined.correction, -LARGEST_STEP * prior_std, LARGEST_STEP * prior_std)
         corrections = dict(zip((constant.name for constant in constants), step.tolist(), strict=True))
         roll = joint_roll(passes)
         if is_vehicle and roll.is_known:
             corrections["mounting_roll"] = -roll.joint[0]
         current, moved = changed(current, corrections), moved + step
-        share = np.abs(step) / np.maximum(np.sqrt(np.diag(combined.covariance)), least)
+        share = np.abs(step) / std
         if share.max() < SETTLED_SHARE and abs(corrections.get("mounting_roll", 0.0)) < SETTLED_ROLL:
             break
     else:

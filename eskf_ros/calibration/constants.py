@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,6 +49,9 @@ class Constant:
 TURNS = "turns to the left and to the right, with speed"
 TILT = "roll and pitch of the vehicle: ramps, kerbs, rough ground"
 SPEED_CHANGES = "speeding up and braking"
+
+MOUNTING_LEAST_DEG = 0.05
+"""deg; load and springs turn a vehicle against its wheels by as much from one drive to the next."""
 
 MOUNTING = ("mounting_yaw", "mounting_pitch")
 """Constants that turn base_link itself: `changed` treats them apart."""
@@ -98,7 +101,7 @@ CONSTANTS = (
         "imu.mount_rpy_deg",
         2,
         math.radians(5.0),
-        math.radians(0.02),
+        math.radians(MOUNTING_LEAST_DEG),
         "deg",
         "driving straight on, after turns that show the heading",
         ("vehicle",),
@@ -111,7 +114,7 @@ CONSTANTS = (
         "imu.mount_rpy_deg",
         1,
         math.radians(5.0),
-        math.radians(0.02),
+        math.radians(MOUNTING_LEAST_DEG),
         "deg",
         "driving straight on, with speed",
         ("vehicle",),
@@ -153,10 +156,13 @@ def constants_of(inputs: Collection[str], is_vehicle: bool) -> tuple[Constant, .
     return tuple(constant for constant in CONSTANTS if set(constant.needs) <= there)
 
 
-def as_states(parameters: Parameters, constants: Collection[Constant], is_vehicle: bool) -> Parameters:
-    """Return the parameters with the constants as augmented states without process noise."""
+def as_states(parameters: Parameters, constants: Sequence[Constant], is_vehicle: bool, first_std: Array) -> Parameters:
+    """Return the parameters with the constants as augmented states without process noise.
+
+    ``first_std`` (n,): their standard deviations at first, as `begin_stds` returns them.
+    """
     values: dict[str, Any] = dict(to_mapping(parameters))
-    stds = {constant.block: constant.prior_std for constant in constants}
+    stds = dict(zip((constant.block for constant in constants), first_std.tolist(), strict=True))
     values |= {
         "nhc.enabled": is_vehicle,
         "estimate.lever_arm": "lever_arm" in stds,
@@ -169,30 +175,35 @@ def as_states(parameters: Parameters, constants: Collection[Constant], is_vehicl
         "estimate.wheel_scale_random_walk": 0.0,
         "heading.offset_random_walk": 0.0,
     }
-    names = {"lever_arm": "estimate.lever_arm_std", "time_offset": "estimate.time_offset_std"}
-    names |= {"imu_scale": "estimate.imu_scale_std", "nhc_position": "estimate.nhc_position_std"}
-    names |= {"mounting": "estimate.mounting_std_deg", "wheel_scale": "estimate.wheel_scale_std"}
-    names |= {"heading_offset": "heading.offset_std_deg"}
-    for block, name in names.items():
+    for block, name in STD_PARAMETERS.items():
         if block in stds:
             values[name] = math.degrees(stds[block]) if name.endswith("_deg") else stds[block]
-    # One standard deviation serves all time offsets in the filter.
-    values["estimate.time_offset_std"] = max(
-        (constant.prior_std for constant in constants if constant.name.endswith("time_offset")), default=0.1
-    )
     return from_mapping(values)
+
+
+STD_PARAMETERS = {
+    "lever_arm": "estimate.lever_arm_std",
+    "time_offset": "estimate.time_offset_std",
+    "imu_scale": "estimate.imu_scale_std",
+    "nhc_position": "estimate.nhc_position_std",
+    "mounting": "estimate.mounting_std_deg",
+    "wheel_scale": "estimate.wheel_scale_std",
+    "heading_offset": "heading.offset_std_deg",
+}
+"""The parameters of the standard deviations at first, by block; one for all elements, and for all time offsets."""
+
+
+def begin_stds(constants: Sequence[Constant], wanted: Array) -> Array:
+    """Return the standard deviations (n,) with which a filter begins that should begin with ``wanted`` or more."""
+    kinds = ["time_offset" if c.block.endswith("time_offset") else c.block for c in constants]
+    largest = {kind: max(std for k, std in zip(kinds, wanted.tolist(), strict=True) if k == kind) for kind in kinds}
+    return np.array([largest[kind] for kind in kinds])
 
 
 def places_of(parameters: Parameters, constants: Collection[Constant]) -> list[int]:
     """Return the indices of the constants in the error state of a filter with these parameters."""
     settings = settings_from(parameters)[0]
     return [int(settings[f"{constant.block}_at"]) + constant.index for constant in constants]
-
-
-def prior_stds(parameters: Parameters, constants: Collection[Constant]) -> Array:
-    """Return the standard deviations with which a filter with these parameters begins."""
-    time_std = parameters.estimate.time_offset_std
-    return np.array([time_std if c.name.endswith("time_offset") else c.prior_std for c in constants])
 
 
 def changed(parameters: Parameters, corrections: Mapping[str, float]) -> Parameters:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.api import Filter
-from eskf_ros.calibration.constants import Constant, places_of, prior_stds
+from eskf_ros.calibration.constants import Constant, places_of
 from eskf_ros.calibration.roll import ROW_RATE, Roll, roll_of
 from eskf_ros.filter.state.error_state import ERROR_SIZE
 from eskf_ros.parameters.tree import Parameters
@@ -74,21 +74,21 @@ def filtered(tables: Tables, parameters: Parameters, rate: float = ROW_RATE) -> 
     return filter_
 
 
-def run_pass(recording: Recording, parameters: Parameters, constants: Sequence[Constant]) -> Pass:
+def run_pass(recording: Recording, parameters: Parameters, constants: Sequence[Constant], first_std: Array) -> Pass:
     """Run the filter over a recording; ``parameters`` have the constants as states (`constants.as_states`)."""
     filter_ = filtered(recording.tables, parameters)
     result = filter_.result()
-    state, first = filter_.state, prior_stds(parameters, constants)
+    state = filter_.state
     places = places_of(parameters, constants)
     used = [k for k, place in enumerate(places) if place < state["error_size"]]
-    correction, covariance = np.zeros(len(constants)), np.diag(first**2)
+    correction, covariance = np.zeros(len(constants)), np.diag(first_std**2)
     at = [places[k] for k in used]
     correction[used] = state["optional"][np.array(at, int) - ERROR_SIZE]
     covariance[np.ix_(used, used)] = state["covariance"][np.ix_(at, at)]
     return Pass(
         correction,
         covariance,
-        first,
+        first_std,
         mean_nis(result.summary["aids"], result.innovations),
         roll_of(result.odometry),
         int(result.summary["restarts"]),

@@ -15,13 +15,14 @@ from scipy.spatial.transform import Rotation
 from calibration import tables_of
 from eskf_ros.calibration.coarse_mounting import coarse_mounting
 from eskf_ros.calibration.combine import combine
-from eskf_ros.calibration.constants import CONSTANTS, as_states, changed, constants_of, places_of
+from eskf_ros.calibration.constants import CONSTANTS, as_states, begin_stds, changed, constants_of, places_of
 from eskf_ros.calibration.findings import Calibration, Finding, findings_of
 from eskf_ros.calibration.noise import rest_and_road
 from eskf_ros.calibration.recording import Pass
 from eskf_ros.calibration.report import parameter_file
 from eskf_ros.calibration.roll import ROW_RATE, Roll, roll_of
 from eskf_ros.filter.output.global_odometry import ODOMETRY
+from eskf_ros.filter.settings import settings_from
 from eskf_ros.filter.state.error_state import ERROR_SIZE
 from eskf_ros.parameters.mapping import from_mapping, to_mapping
 from eskf_ros.parameters.ros_yaml import load
@@ -115,7 +116,10 @@ def test_another_base_link_leaves_imu_and_antenna_where_they_are() -> None:
 def test_each_constant_is_a_state_of_its_own() -> None:
     constants = constants_of({"gnss_position", "gnss_velocity", "wheel", "heading"}, True)
     assert constants == CONSTANTS
-    places = places_of(as_states(Parameters(), constants, True), constants)
+    first_std = begin_stds(constants, np.array([constant.prior_std for constant in constants]))
+    states = as_states(Parameters(), constants, True, first_std)
+    places = places_of(states, constants)
+    np.testing.assert_allclose(settings_from(states)[0]["optional_std"][np.array(places) - ERROR_SIZE], first_std)
     assert len(set(places)) == len(places)
     assert min(places) >= ERROR_SIZE
     assert {c.name for c in constants_of({"gnss_position"}, False)} == {

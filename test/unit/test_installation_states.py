@@ -13,12 +13,13 @@ import pytest
 from numpy.typing import NDArray
 
 from eskf_ros.filter.alignment.heading import reset_heading
+from eskf_ros.filter.alignment.levelling import reset_tilt
 from eskf_ros.filter.integrity.humble_lane import size_for_gnss
 from eskf_ros.filter.measurements.antenna import antenna_velocity, lever_arm_of, time_offset_of
 from eskf_ros.filter.predict import step
 from eskf_ros.filter.state.augmented_states import update_error_size
 from eskf_ros.filter.state.enums import Stream
-from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, NOWHERE, POSITION, VELOCITY
+from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, NOWHERE, POSITION, VELOCITY
 from eskf_ros.geodesy.rotation import to_matrix
 from support.kernels import copy_of, make_settings, make_work, random_state, to_rotation
 
@@ -124,6 +125,22 @@ def test_an_open_lever_arm_makes_the_position_uncertain_once_the_heading_is_know
     # What is left is the way that the time offset may stand for.
     velocity = np.array(state["velocity_map"])
     np.testing.assert_allclose(antenna, np.outer(velocity, velocity) * 0.1**2, atol=1e-9)
+
+
+def test_scales_of_accelerometers_have_tilted_the_level() -> None:
+    """At rest a scale error reads as a bias does: once both are open, the tilt follows the sum of the two."""
+    state = random_state(3)
+    state["attitude"] /= np.linalg.norm(state["attitude"])
+    update_error_size(state, int(ALL["reach"].max()), ALL)
+    rotation, up = np.array(to_matrix(state["attitude"])), np.array([0.0, 0.0, 1.0])
+    force = 9.8 * rotation.T @ up
+    reset_tilt(state, tuple(up), 9.8, (0.0, 0.0, 0.0), 0.2**2, 1e-8, ALL)
+    covariance = state["covariance"]
+    for k in range(3):
+        by_bias = covariance[ATTITUDE : ATTITUDE + 3, ACCEL_BIAS + k] / 0.2**2
+        by_scale = covariance[ATTITUDE : ATTITUDE + 3, SCALE + k] / 0.01**2
+        np.testing.assert_allclose(by_scale, by_bias * force[k], atol=1e-12)
+    np.testing.assert_allclose(covariance, covariance.T, atol=1e-15)
 
 
 def test_the_humble_lane_has_what_fixes_need() -> None:

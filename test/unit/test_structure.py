@@ -56,7 +56,13 @@ WRITERS = {
     "integrity/scatter.py": {"inflate_lasting_error"},
     "measurements/kalman_update.py": {"update_covariance", "update_nominal_state"},
     "measurements/mag.py": {"propagate_mag_error"},
-    "state/augmented_states.py": {"reset_augmented", "propagate_augmented", "propagate_clock", "propagate_scale"},
+    "state/augmented_states.py": {
+        "reset_augmented",
+        "propagate_augmented",
+        "propagate_clock",
+        "propagate_scale",
+        "inflate_tilt_by_scale",
+    },
     "tight/epoch.py": {"inflate_or_reset_by_majority"},
     "tight/receiver_clock.py": {"reset_clock", "reset_or_jump_clock"},
 }

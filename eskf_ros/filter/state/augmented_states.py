@@ -11,14 +11,19 @@ from __future__ import annotations
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, VELOCITY
+from eskf_ros.geodesy.rotation import cross, dot, to_matrix
 
 
 @njit
 def update_error_size(state, reach, settings):
     """Activate augmented states until ``reach`` errors are in use."""
     if reach > state.error_size:
-        reset_augmented(state, state.error_size, reach - state.error_size, settings)
+        first = state.error_size
+        reset_augmented(state, first, reach - first, settings)
         state.error_size = reach
+        if first <= settings.imu_scale_at < reach:
+            # They join with the first fix, which is at the datum: z of map is up.
+            inflate_tilt_by_scale(state, (0.0, 0.0, 1.0), settings)
 
 
 @njit
@@ -65,6 +70,28 @@ def unscaled(state, reading, bias, first, settings):
         (reading[1] - bias[1]) / (1.0 + scale[1]) + bias[1],
         (reading[2] - bias[2]) / (1.0 + scale[2]) + bias[2],
     )
+
+
+@njit
+def inflate_tilt_by_scale(state, up, settings):
+    """Give the tilt its share of the scale errors of the accelerometers, where they are estimated.
+
+    Levelling takes what they read at rest for gravity: a scale error s tilts the level as the bias s f does (see
+    `alignment.levelling.reset_tilt`), theta = up x (R s f) / g with f = g R' up. ``up``: unit vector (map).
+    """
+    place, covariance = settings.imu_scale_at, state.covariance
+    if place >= state.error_size:
+        return
+    rotation = to_matrix(state.attitude)
+    for k in range(3):
+        axis = (rotation[0][k], rotation[1][k], rotation[2][k])
+        along, tilt = dot(up, axis), cross(up, axis)
+        for i in range(3):
+            for j in range(state.error_size):
+                covariance[ATTITUDE + i, j] += along * tilt[i] * covariance[place + k, j]
+        for i in range(3):
+            for j in range(state.error_size):
+                covariance[j, ATTITUDE + i] += along * tilt[i] * covariance[j, place + k]
 
 
 @njit
