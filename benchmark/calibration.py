@@ -1,4 +1,4 @@
-"""The calibration campaign: simulated city drives with a known installation, and the real drives.
+"""The calibration campaign: simulated city drives with a known installation, of which nothing is told.
 
     python benchmark/calibration.py [--seeds N] [--jobs N] [CASE ...]
 
