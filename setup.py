@@ -85,7 +85,10 @@ setup(
         "report": ["bokeh>=3.4"],
         # Fleets of recordings on a Dask cluster (--dask); processes of one machine (--jobs) need nothing.
         "dask": ["distributed"],
+        # eskf_calibrate --static: the Allan deviation, and its plot; LGPL-3.0, pure Python.
+        "calibrate": ["allantools", "matplotlib"],
         "test": [
+            "allantools",
             "bokeh>=3.4",
             "distributed",
             "gtsam",
@@ -109,6 +112,7 @@ setup(
             "eskf_replay = eskf_ros.replay.main:main",
             "eskf_report = eskf_ros.report.main:main",
             "eskf_check = eskf_ros.doctor.main:main",
+            "eskf_calibrate = eskf_ros.calibration.main:main",
             "eskf_ranges = eskf_ros.inputs.ranges_command:main",
             "eskf_simulate = eskf_ros.simulate.main:main",
             "eskf_watch = eskf_ros.watch.main:main",

@@ -154,6 +154,12 @@ class Filter:
         self._records: list[NDArray[Any]] = []
         self._unused: dict[str, list[str]] = {}
 
+    @property
+    def state(self) -> np.void:
+        """The estimate at the newest IMU sample that was processed, with its covariance (`filter.layout.STATE`)."""
+        state: np.void = self._navigator.state[0]
+        return state
+
     def push_imu(self, imu: Any) -> None:
         """Take IMU samples; columns as in the module docstring. Raises ValueError for a table that cannot be used."""
         table = Table("imu", imu)

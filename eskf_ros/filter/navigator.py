@@ -254,6 +254,10 @@ class Navigator(Readout):
         parts = []
         first = 0
         times = stamps + self._clock.shift
+        imu = self.parameters.imu
+        if any(imu.accel_scale) or any(imu.gyro_scale):
+            specific_force = specific_force / (1.0 + np.array(imu.accel_scale))
+            angular_rate = angular_rate / (1.0 + np.array(imu.gyro_scale))
         while first < len(times):
             self._make_room()
             batch = min(first + IMU_BATCH, len(times))

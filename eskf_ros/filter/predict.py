@@ -39,6 +39,10 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
     """
     # With an unknown heading the direction of the measured acceleration on the map is unknown: it is not integrated.
     coupling = 0.0 if state.heading_known == 0 else 1.0
+    force_0 = augmented_states.unscaled(state, force_0, state.accel_bias, 0, settings)
+    force_1 = augmented_states.unscaled(state, force_1, state.accel_bias, 0, settings)
+    rate_0 = augmented_states.unscaled(state, rate_0, state.gyro_bias, 3, settings)
+    rate_1 = augmented_states.unscaled(state, rate_1, state.gyro_bias, 3, settings)
     middle, force, gravity = propagate_nominal_state(state, force_0, rate_0, force_1, rate_1, dt, coupling)
     # Motion hidden by a gap is assumed to be constant; this density gives the same variance at its end.
     accel_noise, gyro_noise, accel_walk, gyro_walk = imu_noise(state.doubt, settings)
@@ -50,6 +54,7 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
         velocity_noise += WANDER_TIME * (WANDER_ACCELERATION**2 + dot(acceleration, acceleration))
     size, covariance = state.error_size, state.covariance
     force = credible_force(state.excitation, covariance, middle, force, gravity, dt, settings.accel_noise_density)
+    augmented_states.propagate_scale(state, middle, force_1, rate_1, dt, coupling, settings)
     propagate_covariance(covariance, size, middle, force, gravity, state.frame.earth_rate_map, dt, coupling, work)
     propagate_noise(covariance, velocity_noise, attitude_noise, accel_walk, gyro_walk, dt)
     if state.quality.is_doubted == 1:

@@ -155,6 +155,9 @@ def place_optional_states(settings: np.void, parameters: Parameters) -> None:
 def optional_blocks(parameters: Parameters) -> tuple[OptionalBlock, ...]:
     """Return the augmented states in the order of their indices."""
     blocks = [block for row in ROWS for block in row.augmented(parameters)]
+    estimate = parameters.estimate
+    streams = (Stream.GNSS_POSITION, Stream.PSEUDORANGE)
+    blocks.append(OptionalBlock("imu_scale", is_on=estimate.imu_scale, std=estimate.imu_scale_std, streams=streams))
     return tuple(sorted(blocks, key=lambda block: list(OPTIONAL_SIZES).index(block.name)))
 
 

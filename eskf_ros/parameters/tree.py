@@ -195,6 +195,16 @@ class Imu:
         minimum=0.0,
         maximum=10.0,
     )
+    gyro_scale: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0),
+        "",
+        "By which share the gyros read too much, along x, y, z of the IMU: reading = (1 + scale) rate + bias.",
+        minimum=-0.2,
+        maximum=0.2,
+    )
+    accel_scale: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0), "", "The same of the accelerometers.", minimum=-0.2, maximum=0.2
+    )
     gap: float = parameter(
         0.1,
         "s",
@@ -353,6 +363,38 @@ class SecondGnss:
 
 @dataclass(frozen=True)
 class Estimate:
+    lever_arm: bool = parameter(
+        False,
+        "",
+        "Estimate what gnss.lever_arm lacks, from positions and velocities of the first receiver. Turns show x and y, "
+        "roll and pitch show z; what nothing shows stays uncertain. eskf_calibrate does it once and for all.",
+    )
+    lever_arm_std: float = parameter(
+        0.5, "m", "Standard deviation of gnss.lever_arm per axis at start.", above=0.0, maximum=100.0
+    )
+    time_offset: bool = parameter(
+        False,
+        "",
+        "Estimate what gnss.time_offset, gnss.velocity_time_offset and wheel.time_offset lack. Accelerations show it.",
+    )
+    time_offset_std: float = parameter(
+        0.1, "s", "Standard deviation of each of the three at start.", above=0.0, maximum=10.0
+    )
+    imu_scale: bool = parameter(
+        False,
+        "",
+        "Estimate what imu.gyro_scale and imu.accel_scale lack. Turns show the one about the vertical; the others need "
+        "a motion that turns and accelerates along all axes.",
+    )
+    imu_scale_std: float = parameter(
+        0.01, "", "Standard deviation of these scales per axis at start.", above=0.0, maximum=0.2
+    )
+    nhc_position: bool = parameter(
+        False, "", "Estimate how far ahead of nhc.position the axle is that does not steer. Turns show it."
+    )
+    nhc_position_std: float = parameter(
+        1.0, "m", "Standard deviation of this distance at start.", above=0.0, maximum=100.0
+    )
     wheel_scale: bool = parameter(
         True,
         "",

@@ -37,6 +37,8 @@ ROS_PACKAGES = {
 ROS_TEST_PACKAGES = {"rosgraph_msgs", "std_msgs"}
 # Used where somebody else has installed it.
 OPTIONAL = {"bokeh", "pandas", "robot_localization", "pygeomag"}
+# What `eskf_calibrate --static` imports when it is asked for: the extra [calibrate].
+CALIBRATE = {"allantools", "matplotlib"}
 # Import name -> rosdep key that brings it, where it is not python3-NAME.
 ROSDEP_KEYS = {
     "lz4": "mcap-ros2-support",
@@ -82,7 +84,7 @@ def imports_of(paths: Iterable[Path]) -> set[str]:
 def third_party_imports() -> set[str]:
     """What the package and its launch files import, but for Python's and the package's own."""
     names = imports_of([*(CHECKOUT / "eskf_ros").rglob("*.py"), *(CHECKOUT / "launch").glob("*.py")])
-    return names - set(sys.stdlib_module_names) - OPTIONAL - {"eskf_ros"}
+    return names - set(sys.stdlib_module_names) - OPTIONAL - CALIBRATE - {"eskf_ros"}
 
 
 def third_party_imports_of_tests() -> set[str]:
@@ -134,6 +136,8 @@ def test_names_and_licence_agree() -> None:
 
 def test_every_import_is_declared_for_pip_and_for_rosdep() -> None:
     required = distributions(SETUP["install_requires"])  # type: ignore[arg-type]
+    extras: dict[str, list[str]] = SETUP["extras_require"]  # type: ignore[assignment]
+    assert set(extras["calibrate"]) == CALIBRATE
     keys = dependencies("exec_depend")
     imported = third_party_imports()
     assert keys >= ROS_PACKAGES <= imported

@@ -46,6 +46,10 @@ INSTALLATION: dict[str, Any] = {
     "estimate__mounting": True,
     "estimate__wheel_scale": True,
     "estimate__magnetic_bias": True,
+    "estimate__lever_arm": True,
+    "estimate__time_offset": True,
+    "estimate__imu_scale": True,
+    "estimate__nhc_position": True,
     "zupt__enabled": True,
     "nhc__enabled": True,
 }

@@ -39,13 +39,14 @@ FLOORS = (
     ("replay", "simulate", "migrate"),
     ("tables", "doctor", "watch"),
     ("api",),
+    ("calibration",),
     ("ros_node",),
 )
 """From the lowest floor to the highest: a room imports from floors below it, and from itself."""
 
 WRITERS = {
     "alignment/first_fix.py": {"reset_position_to_fix", "reset_pose"},
-    "alignment/heading.py": {"reset_heading"},
+    "alignment/heading.py": {"inflate_position", "reset_heading"},
     "alignment/heading_sensors.py": {"reset_given_heading", "reset_to_unknown_heading"},
     "alignment/levelling.py": {"reset_tilt", "update_gyro_bias_at_rest", "reset_level_to_moving"},
     "inertial/covariance.py": {"propagate_noise", "propagate_axis_noise", "propagate_covariance", "update_error_axes"},
@@ -56,7 +57,13 @@ WRITERS = {
     "integrity/fix_errors.py": {"inflate_lasting_error", "propagate_walk", "reset_scatter"},
     "measurements/kalman_update.py": {"update_covariance", "update_nominal_state"},
     "measurements/mag.py": {"propagate_mag_error"},
-    "state/augmented_states.py": {"reset_augmented", "propagate_augmented", "propagate_clock"},
+    "state/augmented_states.py": {
+        "reset_augmented",
+        "propagate_augmented",
+        "propagate_clock",
+        "propagate_scale",
+        "inflate_tilt_by_scale",
+    },
     "tight/epoch.py": {"inflate_or_reset_by_majority"},
     "tight/receiver_clock.py": {"reset_clock", "reset_or_jump_clock"},
 }

@@ -19,7 +19,7 @@ from eskf_ros.filter.inertial.navigation_frame import (
 from eskf_ros.filter.measurements.gnss_position import position_of_fix
 from eskf_ros.filter.measurements.jacobians import set_east_north_up_covariance
 from eskf_ros.filter.state.enums import Stream
-from eskf_ros.filter.state.error_state import ATTITUDE
+from eskf_ros.filter.state.error_state import ATTITUDE, POSITION
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.geodesy.earth import east_north_up_to_ecef, geodetic_to_ecef
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix, wrapped
@@ -87,6 +87,36 @@ def reset_heading(state, heading, std, settings):
         turned = rotate(to_matrix(state.attitude), settings.lever_arms_body[0])
         for i in range(3):
             state.position_map[i] += lever[i] - turned[i]
+        if state.heading_known == 0:
+            inflate_position_by_antenna(state, settings)
+
+
+@njit
+def inflate_position_by_antenna(state, settings):
+    """Give the position its share of the errors of lever arm and time offset, where they are estimated.
+
+    With an unknown heading fixes did not enter through them: what is known as well as the fixes is the antenna. From
+    now on it is p = antenna - R lever_arm - velocity time_offset, in the covariance, too.
+    """
+    rotation = to_matrix(state.attitude)
+    if settings.lever_arm_at < state.error_size:
+        for k in range(3):
+            m = settings.imu_to_base
+            inflate_position(state, settings.lever_arm_at + k, rotate(rotation, (m[k, 0], m[k, 1], m[k, 2])))
+    if settings.time_offset_at < state.error_size:
+        v = state.velocity_map
+        inflate_position(state, settings.time_offset_at, (v[0], v[1], v[2]))
+
+
+@njit
+def inflate_position(state, place, effect):
+    """Subtract ``effect`` times the error at index ``place`` from that of the position, on both sides of P."""
+    for i in range(3):
+        for j in range(state.error_size):
+            state.covariance[POSITION + i, j] -= effect[i] * state.covariance[place, j]
+    for i in range(3):
+        for j in range(state.error_size):
+            state.covariance[j, POSITION + i] -= effect[i] * state.covariance[j, place]
 
 
 @njit

@@ -11,6 +11,7 @@ from eskf_ros.filter.alignment.heading import reset_heading
 from eskf_ros.filter.alignment.heading_search import note_level
 from eskf_ros.filter.alignment.warm_start import do_biases_hold
 from eskf_ros.filter.inertial.navigation_frame import heading_of, local_up, reset_attitude, shortest_turn
+from eskf_ros.filter.state.augmented_states import inflate_tilt_by_scale
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_CAPACITY, ERROR_SIZE, GYRO_BIAS
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity.residual_motion import can_be_bias, is_moving, note_sway
@@ -165,6 +166,7 @@ def reset_tilt(state, up, strength, accel_bias, accel_variance, tilt_noise, sett
             covariance[ATTITUDE + i, ATTITUDE + j] = (
                 horizontal * (accel_variance / strength**2 + tilt_noise) + up[i] * up[j] * heading_variance
             )
+    inflate_tilt_by_scale(state, up, settings)
 
 
 @njit

@@ -117,10 +117,24 @@ def start(states, settings):
     if is_running(states) and humble.covariance[ATTITUDE + 2, ATTITUDE + 2] < LOST_HEADING_STD**2:
         return
     states[HUMBLE] = states[FILTER]
-    has_lasting_error = settings.position_error_at < state.error_size
-    humble.error_size = settings.position_error_at + 3 if has_lasting_error else ERROR_SIZE
+    humble.error_size = size_for_gnss(state, settings)
     humble.doubt = 1.0
     state.trust.evidence = 0.0
+
+
+@njit
+def size_for_gnss(state, settings):
+    """Return how many of the errors in use the core has, and positions and velocities of GNSS."""
+    size = ERROR_SIZE
+    if settings.position_error_at < state.error_size:
+        size = settings.position_error_at + 3
+    if settings.lever_arm_at < state.error_size:
+        size = settings.lever_arm_at + 3
+    if settings.time_offset_at < state.error_size:
+        size = settings.time_offset_at + 1
+    if settings.velocity_time_offset_at < state.error_size:
+        size = settings.velocity_time_offset_at + 1
+    return size
 
 
 @njit

@@ -14,6 +14,13 @@ import math
 from typing import Any
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.measurements.antenna import (
+    carry_position,
+    lever_arm_block,
+    lever_arm_of,
+    set_lever_arm,
+    time_offset_blocks,
+)
 from eskf_ros.filter.measurements.jacobians import clear, set_east_north_up_covariance, set_identity, set_minus_cross
 from eskf_ros.filter.measurements.row import NEEDS_LEVEL, OptionalBlock, Row, threefold
 from eskf_ros.filter.state.enums import Stream
@@ -48,7 +55,7 @@ def position_of_fix(state, payload):
 @njit
 def predict(state, source, settings):
     """Return the map position (m) of the antenna of receiver ``source``: position + R lever_arm."""
-    lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[source])
+    lever = rotate(to_matrix(state.attitude), lever_arm_of(state, source, settings))
     return (state.position_map[0] + lever[0], state.position_map[1] + lever[1], state.position_map[2] + lever[2])
 
 
@@ -113,14 +120,16 @@ def linearize_antenna(state, measured, source, settings, work):
         work.innovation[i] = measured[i] - predicted[i]
     set_identity(work.jacobian, POSITION)
     if state.heading_known == 1:
-        lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[source])
-        set_minus_cross(work.jacobian, ATTITUDE, lever)
+        rotation = to_matrix(state.attitude)
+        set_minus_cross(work.jacobian, ATTITUDE, rotate(rotation, lever_arm_of(state, source, settings)))
+        set_lever_arm(work.jacobian, state, rotation, source, False, settings)
+        carry_position(state, rotation, source, settings, work)
 
 
 @njit
 def add_unknown_lever(state, source, settings, work):
     """Add to the noise that the lever arm points anywhere around the vertical while the heading is unknown."""
-    lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[source])
+    lever = rotate(to_matrix(state.attitude), lever_arm_of(state, source, settings))
     for i in range(2):
         work.noise[i, i] += lever[0] ** 2 + lever[1] ** 2
 
@@ -136,7 +145,7 @@ def limits(gnss: Any) -> dict[str, Any]:
 
 
 def augmented(parameters: Any) -> tuple[OptionalBlock, ...]:
-    """Return the correlated error of the fixes or, in mode tight, of the ranges."""
+    """Return the correlated error of the fixes or, in mode tight, of the ranges; lever arm and time offsets."""
     time = parameters.ranges.correlation_time if parameters.mode == "tight" else parameters.gnss.correlation_time
     return (
         OptionalBlock(
@@ -147,6 +156,8 @@ def augmented(parameters: Any) -> tuple[OptionalBlock, ...]:
             correlation_time=time,
             streams=(Stream.GNSS_POSITION,) if parameters.gnss.correlated_share > 0.0 else (),
         ),
+        lever_arm_block(parameters.estimate),
+        *time_offset_blocks(parameters.estimate),
     )
 
 

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import body_rate, local_east_north_up_to_ecef
+from eskf_ros.filter.measurements.antenna import antenna_velocity, carry_velocity, lever_arm_of, set_lever_arm
 from eskf_ros.filter.measurements.jacobians import clear, set_east_north_up_covariance, set_identity, set_minus_cross
 from eskf_ros.filter.measurements.row import (
     BARE_TWIST,
@@ -45,13 +46,7 @@ def noise_factor(state, source):
 @njit
 def predict(state, source, settings):
     """Return the velocity (m/s, map) of the antenna of receiver ``source``."""
-    rotation = to_matrix(state.attitude)
-    lever_velocity = rotate(rotation, cross(body_rate(state, rotation), settings.lever_arms_body[source]))
-    return (
-        state.velocity_map[0] + lever_velocity[0],
-        state.velocity_map[1] + lever_velocity[1],
-        state.velocity_map[2] + lever_velocity[2],
-    )
+    return antenna_velocity(state, to_matrix(state.attitude), source, settings)
 
 
 @njit
@@ -81,7 +76,7 @@ def linearize_antenna(state, measured, source, settings, work):
         work.innovation[i] = measured[i] - predicted[i]
     set_identity(work.jacobian, VELOCITY)
     rotation = to_matrix(state.attitude)
-    arm = settings.lever_arms_body[source]
+    arm = lever_arm_of(state, source, settings)
     lever = rotate(rotation, arm)
     lever_velocity = rotate(rotation, cross(body_rate(state, rotation), arm))
     # The gyro reading of this instant carries the white noise of one sample.
@@ -107,6 +102,8 @@ def linearize_antenna(state, measured, source, settings, work):
         row = cross((rotation[i][0], rotation[i][1], rotation[i][2]), arm)
         for j in range(3):
             work.jacobian[i, GYRO_BIAS + j] = row[j]
+    set_lever_arm(work.jacobian, state, rotation, source, True, settings)
+    carry_velocity(state, rotation, source, settings, work)
 
 
 def read(messages: npt.NDArray[Any]) -> Readings:

@@ -32,10 +32,10 @@ from eskf_ros.filter.measurements.jacobians import (
     set_point_velocity_row,
     vehicle_axes,
 )
-from eskf_ros.filter.measurements.row import Row, arm_body
+from eskf_ros.filter.measurements.row import OptionalBlock, Row, arm_body
 from eskf_ros.filter.measurements.zupt import CONSTRAINT_GATE_PROBABILITY
 from eskf_ros.filter.state.enums import Stream
-from eskf_ros.filter.state.error_state import ATTITUDE
+from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity.detector import has_block, mean_force
 from eskf_ros.geodesy.rotation import cross, dot, to_matrix
@@ -55,11 +55,20 @@ SLIPPING = 5.0
 
 
 @njit
+def arm_of(state, forward, settings):
+    """Return the lever arm (m, IMU axes) of the constrained point; what is estimated of it lies along ``forward``."""
+    arm, place = settings.nhc.arm_body, settings.nhc_position_at
+    ahead = state.optional[place - ERROR_SIZE] if place < state.error_size else 0.0
+    return (arm[0] + ahead * forward[0], arm[1] + ahead * forward[1], arm[2] + ahead * forward[2])
+
+
+@njit
 def predict(state, settings):
     """Return the lateral and the vertical velocity (m/s) of the constrained point."""
     rotation = to_matrix(state.attitude)
-    _forward, left, up = vehicle_axes(state, settings)
-    velocity = point_velocity(state, rotation, body_rate(state, rotation), settings.nhc.arm_body)
+    forward, left, up = vehicle_axes(state, settings)
+    arm = arm_of(state, forward, settings)
+    velocity = point_velocity(state, rotation, body_rate(state, rotation), arm)
     return dot(left, velocity), dot(up, velocity)
 
 
@@ -76,9 +85,9 @@ def linearize(state, settings, work):
         return 0
     clear(work)
     rotation = to_matrix(state.attitude)
-    arm = settings.nhc.arm_body
     forward, left, up = vehicle_axes(state, settings)
-    speed = dot(forward, point_velocity(state, rotation, body_rate(state, rotation), arm))
+    arm, rate = arm_of(state, forward, settings), body_rate(state, rotation)
+    speed = dot(forward, point_velocity(state, rotation, rate, arm))
     sideways, upwards = predict(state, settings)
     _yaw, pitch = mounting_of(state, settings)
     cosine, sine = math.cos(pitch), math.sin(pitch)
@@ -89,6 +98,11 @@ def linearize(state, settings, work):
     set_point_velocity_row(work.jacobian, 1, up, 1.0, state, rotation, arm)
     set_mounting(work.jacobian, 0, -cosine * speed - sine * upwards, 0.0, state, settings)
     set_mounting(work.jacobian, 1, sine * sideways, speed, state, settings)
+
+    if settings.nhc_position_at < state.error_size:
+        # left . (omega x forward), and the same with up.
+        work.jacobian[0, settings.nhc_position_at] = dot(up, rate)
+        work.jacobian[1, settings.nhc_position_at] = -dot(left, rate)
 
     slip = settings.nhc.slip * horizontal_acceleration(state, rotation, mean_force(state))
     angle_variance = settings.nhc.angle_std**2 + slip**2
@@ -187,6 +201,16 @@ def is_enabled(parameters: Any) -> bool:
     return bool(parameters.nhc.enabled)
 
 
+def augmented(parameters: Any) -> tuple[OptionalBlock, ...]:
+    """Return how far ahead of ``nhc.position`` the constrained point is."""
+    estimate = parameters.estimate
+    return (
+        OptionalBlock(
+            "nhc_position", is_on=estimate.nhc_position, std=estimate.nhc_position_std, streams=(Stream.NHC,)
+        ),
+    )
+
+
 ROW = Row(
     Stream.NHC,
     "non-holonomic constraint",
@@ -194,6 +218,7 @@ ROW = Row(
     "Non-holonomic constraint.",
     gate_probability=CONSTRAINT_GATE_PROBABILITY,
     settings=SETTINGS,
+    augmented=augmented,
     describe=describe,
     is_enabled=is_enabled,
 )

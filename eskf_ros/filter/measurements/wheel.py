@@ -23,6 +23,7 @@ import numpy.typing as npt
 from eskf_ros.compiled import njit
 from eskf_ros.filter.history.records import XX, XY, YY
 from eskf_ros.filter.inertial.navigation_frame import body_rate
+from eskf_ros.filter.inertial.strapdown import gravity_map
 from eskf_ros.filter.measurements.jacobians import (
     clear,
     gyro_noise_variance,
@@ -48,7 +49,7 @@ from eskf_ros.filter.measurements.row import (
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, GYRO_BIAS
 from eskf_ros.filter.state.time import NEVER
-from eskf_ros.geodesy.rotation import cross, dot, rotate, to_matrix
+from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix
 from eskf_ros.parameters.schema import Aid, parameter
 
 LASTING_SPEED_ERROR = 0.001
@@ -75,8 +76,8 @@ def scale_of(state, settings):
     """Return the ratio of the speed that the wheels report to the true one."""
     place = settings.wheel_scale_at
     if place >= state.error_size:
-        return 1.0
-    return 1.0 + state.optional[place - ERROR_SIZE]
+        return settings.wheel.scale
+    return settings.wheel.scale + state.optional[place - ERROR_SIZE]
 
 
 @njit
@@ -87,6 +88,22 @@ def predict(state, settings):
     forward, _left, up = vehicle_axes(state, settings)
     velocity = point_velocity(state, rotation, rate, settings.wheel.arm_body)
     return scale_of(state, settings) * dot(forward, velocity), dot(up, rate)
+
+
+@njit
+def forward_acceleration(state, rotation, rate, forward):
+    """Return the derivative (m/s2) of the speed along ``forward`` (unit vector, IMU axes), without vibration.
+
+    forward . (f + R' g - omega x R' v): the time offset of the wheels, where it is estimated, acts through it.
+    """
+    force, bias = state.imu.smooth_force, state.accel_bias
+    gravity = gravity_map(state, (state.position_map[0], state.position_map[1], state.position_map[2]))
+    pull = rotate_back(rotation, gravity)
+    turning = cross(rate, rotate_back(rotation, state.velocity_map))
+    total = 0.0
+    for i in range(3):
+        total += forward[i] * (force[i] - bias[i] + pull[i] - turning[i])
+    return total
 
 
 @njit
@@ -117,6 +134,10 @@ def linearize(state, payload, settings, work):
     size = 0
     if payload[XX] >= 0.0:
         work.innovation[0] = payload[0] - predicted_speed
+        if settings.wheel_time_offset_at < state.error_size:
+            change = scale * forward_acceleration(state, rotation, rate, forward)
+            work.innovation[0] -= change * state.optional[settings.wheel_time_offset_at - ERROR_SIZE]
+            work.jacobian[0, settings.wheel_time_offset_at] = change
         set_point_velocity_row(work.jacobian, 0, forward, scale, state, rotation, arm)
         sideways, upwards = dot(left, velocity), dot(up, velocity)
         set_mounting(work.jacobian, 0, scale * cosine * sideways, -scale * upwards, state, settings)
@@ -154,6 +175,13 @@ class Wheel(Aid):
         "of a single wheel.",
         minimum=-1000.0,
         maximum=1000.0,
+    )
+    scale: float = parameter(
+        1.0,
+        "",
+        "The ratio of the speed that the wheels report to the true one; estimate.wheel_scale finds what it lacks.",
+        minimum=0.5,
+        maximum=2.0,
     )
     slip: float = parameter(
         0.005,
@@ -193,8 +221,8 @@ class Wheel(Aid):
     )
 
 
-SETTINGS = np.dtype([("arm_body", "f8", (3,)), ("slip", "f8")], align=True)
-"""Lever arm of the wheel point (m, IMU axes); slip as a share of the speed per m/s2."""
+SETTINGS = np.dtype([("arm_body", "f8", (3,)), ("scale", "f8"), ("slip", "f8")], align=True)
+"""Lever arm of the wheel point (m, IMU axes); scale of the speed; slip as a share of the speed per m/s2."""
 
 
 def read(messages: npt.NDArray[Any]) -> Readings:
@@ -222,11 +250,12 @@ def limits(wheel: Wheel) -> dict[str, Any]:
 def describe(settings: np.void, parameters: Any) -> None:
     """Fill `SETTINGS` from the parameters."""
     settings["arm_body"] = arm_body(parameters.wheel.position, parameters)
+    settings["scale"] = parameters.wheel.scale
     settings["slip"] = parameters.wheel.slip
 
 
 def augmented(parameters: Any) -> tuple[OptionalBlock, ...]:
-    """Return the mounting of the vehicle's axes in base_link, which the NHC needs, too, and the scale of the speed."""
+    """Return the mounting of the vehicle's axes, which the NHC needs, too, scale and time offset of the speed."""
     estimate = parameters.estimate
     return (
         OptionalBlock(
@@ -241,6 +270,12 @@ def augmented(parameters: Any) -> tuple[OptionalBlock, ...]:
             is_on=estimate.wheel_scale,
             std=estimate.wheel_scale_std,
             noise_density=estimate.wheel_scale_random_walk,
+            streams=(Stream.WHEEL,),
+        ),
+        OptionalBlock(
+            "wheel_time_offset",
+            is_on=estimate.time_offset,
+            std=estimate.time_offset_std,
             streams=(Stream.WHEEL,),
         ),
     )

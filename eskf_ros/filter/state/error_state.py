@@ -23,8 +23,14 @@ ERROR_SIZE = 15
 
 OPTIONAL_SIZES = {
     "position_error": 3,
+    "lever_arm": 3,
+    "time_offset": 1,
+    "velocity_time_offset": 1,
+    "imu_scale": 6,
     "mounting": 2,
     "wheel_scale": 1,
+    "wheel_time_offset": 1,
+    "nhc_position": 1,
     "clock": 2,
     "inter_system": 6,
     "heading_offset": 1,
@@ -35,8 +41,9 @@ OPTIONAL_SIZES = {
 }
 """Augmented states in the order of their indices, and how many errors each has; see `augmented_states`.
 
-``clock``: of the receiver, bias (m) and drift (m/s). ``inter_system``: offset of the ranges of a constellation from
-those of GPS (m), in the order of `INTER_SYSTEM`.
+The first four are what positions and velocities of a receiver need: the humble lane has them, too. ``imu_scale``: of
+the three accelerometers, then of the three gyros. ``clock``: of the receiver, bias (m) and drift (m/s).
+``inter_system``: offset of the ranges of a constellation from those of GPS (m), in the order of `INTER_SYSTEM`.
 """
 
 INTER_SYSTEM = (Gnss.GALILEO, BEIDOU_3, Gnss.GLONASS, Gnss.QZSS, Gnss.BEIDOU, Gnss.SBAS)
