@@ -36,7 +36,7 @@ ROS_PACKAGES = {
 # Imported by the tests alone.
 ROS_TEST_PACKAGES = {"rosgraph_msgs", "std_msgs"}
 # Used where somebody else has installed it.
-OPTIONAL = {"bokeh", "pandas", "robot_localization", "pygeomag"}
+OPTIONAL = {"bokeh", "distributed", "pandas", "robot_localization", "pygeomag"}
 # What `eskf_calibrate --static` imports when it is asked for: the extra [calibrate].
 CALIBRATE = {"allantools", "matplotlib"}
 # Import name -> rosdep key that brings it, where it is not python3-NAME.
