@@ -28,6 +28,8 @@ _EPILOG = """\
 results, in DIR/<bag name>_eskf/ (files of an earlier replay are replaced):
   odometry.mcap   odometry/global and gps/filtered; opens in Foxglove
   trajectory.tum  t x y z qx qy qz qw: base_link in map as it was published at that time, from the first known position
+  trajectory_smoothed.tum  with --smooth: the same trajectory as it is known afterwards; in odometry.mcap as
+                  odometry/smoothed
   aids.csv        one line per GNSS message or signal: stamp, arrival, aid, innovation, NIS, degrees of freedom, verdict
   summary.json    everything in numbers
 
@@ -155,6 +157,11 @@ def _parser() -> argparse.ArgumentParser:
         help="give messages as they were recorded, or sorted by stamp within 10 s (default: %(default)s)",
     )
     parser.add_argument(
+        "--smooth",
+        action="store_true",
+        help="afterwards go back over the recording: the best trajectory, from what came before and after each moment",
+    )
+    parser.add_argument(
         "--output-rate",
         type=_rate,
         default=50.0,
@@ -238,6 +245,7 @@ def _replay(bag: Path, folder: Path, parameters: Parameters, options: argparse.N
         outages=tuple(options.outage),
         mode=options.mode,
         order=options.order,
+        smooth=options.smooth,
         output_rate=options.output_rate,
         ranges=options.ranges,
         navigation=tuple(options.nav),
@@ -323,15 +331,17 @@ def _show(summary: dict[str, Any], folder: Path, to_stderr: bool) -> None:
     )
     if "ranges" in summary:
         console.print(f"Epochs of ranges: {summary['ranges']['epochs']}, withheld: {summary['ranges']['withheld']}")
-    if "error" in summary:
-        errors = _table("error against truth", "rms", "50 %", "95 %", "largest")
+    for label, found in (("error against truth", summary), ("the same, smoothed", summary.get("smoothed", {}))):
+        if "error" not in found:
+            continue
+        errors = _table(label, "rms", "50 %", "95 %", "largest")
         units = {"horizontal": "m", "vertical": "m", "speed": "m/s", "heading_deg": "deg"}
         for name, unit in units.items():
-            error = summary["error"][name] or {}
+            error = found["error"][name] or {}
             values = [_rounded(error.get(key), ".3f") for key in ("rms", "p50", "p95", "max")]
             errors.add_row(f"{name.removesuffix('_deg')}, {unit}", *values)
         console.print(errors)
-        for name, nees in summary["nees"].items():
+        for name, nees in found["nees"].items():
             if nees:
                 console.print(f"NEES {name}: mean {nees['mean']:.2f} (ideal 3), in 95 %: {nees['in_95']:.1%}")
     if summary["outages"]:

@@ -22,6 +22,7 @@ from eskf_ros.inputs.table import FIX
 from eskf_ros.parameters.tree import Parameters
 from eskf_ros.replay.feed import Feed
 from eskf_ros.replay.results import ResultFiles, selected
+from eskf_ros.replay.smoothing import Smoothing
 from eskf_ros.replay.summary import Summary, ranges_result, truth_result
 from eskf_ros.replay.topics import InputError, TopicNames, find_topics, truth_converter
 from eskf_ros.replay.truth import TruthComparison
@@ -34,7 +35,7 @@ TRUTH_RATE = 50.0
 class Options:
     """The options of the command line. Outages are (start, length) in s from the first IMU stamp.
 
-    ``mode``: loose, tight, ins-only, or empty for that of the parameters (tight with a file of `ranges`). ``ranges``,
+    ``smooth``: go back over the recording afterwards. ``mode``: loose, tight, ins-only, or empty for that of the parameters (tight with a file of `ranges`). ``ranges``,
     ``navigation``: RINEX files beside the recording; ``clock_offset``: s by which its stamps are ahead of UTC.
     """
 
@@ -43,6 +44,7 @@ class Options:
     outages: tuple[tuple[float, float], ...] = ()
     mode: str = ""
     order: str = "log"
+    smooth: bool = False
     output_rate: float = 50.0
     ranges: Path | None = None
     navigation: tuple[Path, ...] = ()
@@ -91,13 +93,17 @@ def replay(
         topics, hints = find_topics(reader, bag, parameters, options.truth, options.ranges is not None)
         to_epochs = truth_converter(topics, bag, parameters)
         thinned = bool(topics.truth) and 0.0 < options.output_rate < TRUTH_RATE
-        navigator = Navigator(parameters, output_rate=0.0 if thinned else options.output_rate)
+        output_rate = 0.0 if thinned else options.output_rate
+        navigator = Navigator(parameters, output_rate=output_rate, keeps_log=options.smooth)
         intake, messages = open_ranges(navigator, parameters, options, reader, topics)
         feed = Feed(navigator, topics, options.order, options.outages, options.mode == "ins-only", intake)
-        truth = TruthComparison(parameters.gnss.lever_arm if topics.truth_type == FIX else (0.0, 0.0, 0.0))
+        point = parameters.gnss.lever_arm if topics.truth_type == FIX else (0.0, 0.0, 0.0)
+        truth = TruthComparison(point)
         summary = Summary(feed, options.outages)
 
-        with ResultFiles(options.folder, parameters.frames, options.output_rate if thinned else 0.0) as files:
+        file_rate = options.output_rate if thinned else 0.0
+        with ResultFiles(options.folder, parameters.frames, file_rate, options.smooth) as files:
+            smoothing = Smoothing(navigator, files, point, bool(topics.truth)) if options.smooth else None
 
             def collect(rows: NDArray[Any], records: NDArray[Any]) -> None:
                 known, datum = selected(rows, rows["position_known"]), navigator.datum
@@ -105,6 +111,9 @@ def replay(
                     truth.add_rows(known, datum)
                 summary.add(known, records)
                 clock.lap("compare")
+                if smoothing:
+                    smoothing.collect()
+                    clock.lap("smooth")
                 files.write(rows, records, datum)
                 clock.lap("wait")
 
@@ -114,11 +123,18 @@ def replay(
                 rows = feed.push(batch)
                 clock.lap("filter")
                 if topics.truth in batch:
-                    truth.add_truth(to_epochs(batch[topics.truth]))
+                    epochs = to_epochs(batch[topics.truth])
+                    truth.add_truth(epochs)
+                    if smoothing:
+                        smoothing.keep_truth(epochs)
                 collect(rows, navigator.take_records())
                 progress(reader.bytes_done / reader.bytes_total)
             clock.lap("read")
             collect(np.zeros(0, ODOMETRY), navigator.finish())
+            smoothed = {}
+            if smoothing:
+                smoothed = {"smoothed": smoothing.result(summary)}
+                clock.lap("smooth")
             files.finish()
             clock.lap("wait")
             compared = truth.compared() if topics.truth else None
@@ -130,6 +146,7 @@ def replay(
                 **({} if intake is None else ranges_result(navigator, intake, feed)),
                 **({} if compared is None else truth_result(topics.truth, truth.offered, compared)),
                 "outages": summary.outages(compared),
+                **smoothed,
                 "warnings": [
                     *reader.warnings,
                     *hints,

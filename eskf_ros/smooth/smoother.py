@@ -1,4 +1,4 @@
-"""The smoother of one recording: takes the log of the forward pass while the filter runs, then goes backward over it."""
+"""The smoother of one recording: takes the log of the forward pass while the filter runs, then goes back over it."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Smoother:
         self._numbers: Spill | None = None
         self._stamps: list[NDArray[np.int64]] = []
         self.breaks = 0
-        """How often the recursion had to begin anew between the first and the last node."""
+        """Starts, resets and takeovers of the filter, over which nothing is smoothed."""
 
     @property
     def node_count(self) -> int:
@@ -46,7 +46,7 @@ class Smoother:
         return len(self._nodes)
 
     def collect(self, navigator: Navigator | None = None, everything: bool = False) -> None:
-        """Take what became final of the log; ``navigator``: a copy of that of the beginning, to be ended in its place."""
+        """Take what became final of the log; ``navigator``: a copy of the first one, to be ended in its place."""
         for log in (navigator or self._navigator).take_log(everything):
             if self._numbers is None:
                 self._numbers = Spill(np.float64, log.numbers.shape[1], self._folder)
@@ -66,7 +66,7 @@ class Smoother:
             nodes, numbers = self._nodes.read(first, end), self._numbers.read(first, end)
             smooth_nodes(nodes, numbers, carried, int(settings["clock_at"][0]))
             self._numbers.replace(first, numbers)
-            self.breaks += int(np.count_nonzero((nodes["is_linked"] == 0) | (nodes["is_continued"] == 0)))
+            self.breaks += int(np.count_nonzero((nodes["is_linked"] == 1) & (nodes["is_continued"] == 0)))
 
     def rows(self) -> Iterator[NDArray[Any]]:
         """Yield the smoothed ODOMETRY rows in blocks, at the output stamps; pose in odom and its variances are zero."""

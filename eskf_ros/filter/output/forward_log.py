@@ -219,7 +219,10 @@ def open_node(state, log):
 
 @njit
 def close_node(state, log, is_kept, settings):
-    """End the open node with the estimate after its measurements; drop it if they changed nothing, unless ``is_kept``."""
+    """End the open node with the estimate after its measurements.
+
+    If they changed nothing it is dropped, unless it ``is_kept``.
+    """
     forward = state.forward
     forward.is_open = 0
     k = forward.node_next
