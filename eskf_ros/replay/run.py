@@ -35,8 +35,9 @@ TRUTH_RATE = 50.0
 class Options:
     """The options of the command line. Outages are (start, length) in s from the first IMU stamp.
 
-    ``smooth``: go back over the recording afterwards. ``mode``: loose, tight, ins-only, or empty for that of the parameters (tight with a file of `ranges`). ``ranges``,
+    ``mode``: loose, tight, ins-only, or empty for that of the parameters (tight with a file of `ranges`). ``ranges``,
     ``navigation``: RINEX files beside the recording; ``clock_offset``: s by which its stamps are ahead of UTC.
+    ``smooth``: go back over the recording afterwards.
     """
 
     folder: Path

@@ -37,6 +37,7 @@ class Smoother:
         self._nodes, self._points = Spill(NODE, folder=folder), Spill(POINT, folder=folder)
         self._numbers: Spill | None = None
         self._stamps: list[NDArray[np.int64]] = []
+        self._is_smoothed = False
         self.breaks = 0
         """Starts, resets and takeovers of the filter, over which nothing is smoothed."""
 
@@ -45,9 +46,17 @@ class Smoother:
         """Number of nodes."""
         return len(self._nodes)
 
-    def collect(self, navigator: Navigator | None = None, everything: bool = False) -> None:
-        """Take what became final of the log; ``navigator``: a copy of the first one, to be ended in its place."""
-        for log in (navigator or self._navigator).take_log(everything):
+    def copied_for(self, navigator: Navigator) -> Smoother:
+        """Return a smoother with the same log that ends with ``navigator``, a copy of that of this one."""
+        other = Smoother(navigator, self._folder)
+        other._nodes, other._points = self._nodes.copied(), self._points.copied()
+        other._numbers = None if self._numbers is None else self._numbers.copied()
+        other._stamps = list(self._stamps)
+        return other
+
+    def collect(self, everything: bool = False) -> None:
+        """Take what became final of the log; ``everything``: all of it, after which nothing may be pushed."""
+        for log in self._navigator.take_log(everything):
             if self._numbers is None:
                 self._numbers = Spill(np.float64, log.numbers.shape[1], self._folder)
             self._nodes.append(log.nodes)
@@ -55,14 +64,18 @@ class Smoother:
             self._points.append(log.points)
             self._stamps.append(log.nodes["stamp"].copy())
 
-    def smooth(self, navigator: Navigator | None = None) -> None:
-        """Take the rest of the log, and go backward over all of it; ``navigator`` as in `collect`."""
-        self.collect(navigator, everything=True)
+    def smooth(self) -> None:
+        """Take the rest of the log, and go backward over all of it; to be called once for good."""
+        if self._is_smoothed:
+            return
+        self._is_smoothed = True
+        self.collect(everything=True)
+        if self._numbers is None:
+            return
         settings = settings_from(self._navigator.parameters)
         carried = allocate(PASS)
         for end in range(len(self._nodes), 0, -BLOCK):
             first = max(0, end - BLOCK)
-            assert self._numbers is not None
             nodes, numbers = self._nodes.read(first, end), self._numbers.read(first, end)
             smooth_nodes(nodes, numbers, carried, int(settings["clock_at"][0]))
             self._numbers.replace(first, numbers)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ class Spill:
 
     def __init__(self, dtype: Any, width: int = 0, folder: Path | None = None) -> None:
         """Open the file in ``folder`` (None: that of the system); a row has ``width`` numbers, or one record for 0."""
+        self._arguments = dtype, width, folder
         self._dtype = np.dtype(dtype)
         self._shape = (width,) if width else ()
         self._row_bytes = self._dtype.itemsize * max(1, width)
@@ -23,6 +25,14 @@ class Spill:
 
     def __len__(self) -> int:
         return self._count
+
+    def copied(self) -> Spill:
+        """Return a copy in a file of its own."""
+        other = Spill(*self._arguments)
+        self._file.seek(0)
+        shutil.copyfileobj(self._file, other._file)
+        other._count = self._count
+        return other
 
     def append(self, rows: NDArray[Any]) -> None:
         """Write rows (n,) or (n, width) behind the others."""
