@@ -54,7 +54,7 @@ class ResultFiles:
         self._smooths = smooths
         self._strings = (frames.map, frames.base_link)
         self._interval = round(1e9 / output_rate) if output_rate else 0
-        self._last_stamp = self._last_fix = -1
+        self._last_stamp = self._last_fix = self._last_smoothed = -1
         self._writing: Future[None] | None = None
         self.seconds = 0.0
         self._all = ExitStack()
@@ -111,14 +111,16 @@ class ResultFiles:
         return self._partial
 
     def write_smoothed(self, rows: NDArray[Any]) -> None:
-        """Append smoothed ODOMETRY rows (n,), at the output stamps, to the smoothed trajectory and odometry."""
+        """Append smoothed ODOMETRY rows (n,) to the smoothed trajectory and odometry."""
         self._wait()
         self._writing = self._writer.submit(self._write_smoothed, rows)
 
     def _write_smoothed(self, rows: NDArray[Any]) -> None:
         began = time.perf_counter()
-        self._smoothed_trajectory.write(tum_lines(rows))
-        self._bag.write(self._smoothed, rows["stamp"], odometry_messages(rows), self._strings)
+        chosen = selected(rows, _first_in_each(rows["stamp"], self._last_smoothed, self._interval))
+        self._last_smoothed = int(rows["stamp"][-1])
+        self._smoothed_trajectory.write(tum_lines(chosen))
+        self._bag.write(self._smoothed, chosen["stamp"], odometry_messages(chosen), self._strings)
         self.seconds += time.perf_counter() - began
 
     def _wait(self) -> None:
