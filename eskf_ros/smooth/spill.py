@@ -10,6 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from eskf_ros.compiled import COMPILED
+
+
+def as_records(rows: NDArray[Any]) -> NDArray[Any]:
+    """Return the same rows so that kernels can read their fields, compiled or plain (see `state.memory.allocate`)."""
+    return rows if COMPILED or rows.dtype.names is None else rows.view(np.recarray)
+
 
 class Spill:
     """Rows of one type in a temporary file, which goes with this object; they can be read and replaced in blocks."""
@@ -48,4 +55,4 @@ class Spill:
         """Return the rows from ``first`` up to ``end``, as a copy."""
         self._file.seek(first * self._row_bytes)
         content = bytearray(self._file.read((end - first) * self._row_bytes))
-        return np.frombuffer(content, self._dtype).reshape(-1, *self._shape)
+        return as_records(np.frombuffer(content, self._dtype).reshape(-1, *self._shape))

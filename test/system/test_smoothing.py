@@ -39,7 +39,7 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 BAG = CHECKOUT / "bags" / "tunnel_drive.mcap"
 CONFIG = CHECKOUT / "config" / "tunnel_drive.yaml"
 TUNNEL = (125.0, 170.0)
-RUNS = 16
+RUNS = 40
 
 
 def replayed(out: Path, *options: str) -> Path:
@@ -164,7 +164,7 @@ def test_a_fixed_lag_gives_most_of_it() -> None:
             late = max(late, int(recording.imu_stamp[i] - rows["stamp"][-1]))
     rows = np.concatenate(parts)
     assert late < 14 * 10**9
-    assert set(np.diff(rows["stamp"]).tolist()) == {20_000_000}
+    assert set(np.diff(rows["stamp"][1:]).tolist()) == {20_000_000}
     last = int(np.searchsorted(rows["stamp"], recording.imu_stamp[-1] - 14 * 10**9))
     assert last > len(rows) - 100
     stamps = np.intersect1d(rows["stamp"][rows["heading_known"]], recording.truth_stamp)[50:]
