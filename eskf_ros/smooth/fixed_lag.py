@@ -41,7 +41,15 @@ class FixedLag:
         settings, nothing = settings_from(self._navigator.parameters), allocate_log(0, 0, 0)
         nodes, numbers = nothing.nodes[:0], nothing.numbers[:0]
         smooth_nodes(nodes, numbers, allocate(PASS), 0)
-        write_rows(nothing.points, nodes, numbers, self._navigator.state, allocate(LOCAL), settings, allocate(ODOMETRY))
+        write_rows(
+            nothing.points,
+            nodes,
+            numbers,
+            as_records(self._navigator.state),
+            allocate(LOCAL),
+            settings,
+            allocate(ODOMETRY),
+        )
 
     def forget(self) -> None:
         """Forget all that was logged: the filter began anew."""
@@ -73,7 +81,7 @@ class FixedLag:
         smoothed = numbers.copy()
         settings = settings_from(self._navigator.parameters)
         smooth_nodes(nodes, smoothed, allocate(PASS), int(settings["clock_at"][0]))
-        write_rows(chosen, nodes, smoothed, self._navigator.state, allocate(LOCAL), settings, rows)
+        write_rows(chosen, nodes, smoothed, as_records(self._navigator.state), allocate(LOCAL), settings, rows)
         rows["stamp"] = self._navigator.stamps_of(rows["stamp"])
         needed = max(0, int(np.searchsorted(nodes["stamp"], self._newest)) - 1)
         self._log = Log(nodes[needed:], numbers[needed:], points[ready:])

@@ -16,7 +16,7 @@ from eskf_ros.filter.output.local_odometry import LOCAL
 from eskf_ros.filter.settings import settings_from
 from eskf_ros.filter.state.memory import allocate
 from eskf_ros.smooth.backward import PASS, smooth_nodes
-from eskf_ros.smooth.spill import Spill
+from eskf_ros.smooth.spill import Spill, as_records
 from eskf_ros.smooth.trajectory import write_rows
 
 BLOCK = 2048
@@ -86,7 +86,7 @@ class Smoother:
         if self._numbers is None:
             return
         settings, local = settings_from(self._navigator.parameters), allocate(LOCAL)
-        state = self._navigator.state
+        state = as_records(self._navigator.state)
         stamps = np.concatenate(self._stamps)
         for first in range(0, len(self._points), BLOCK):
             points = self._points.read(first, min(first + BLOCK, len(self._points)))

@@ -660,11 +660,12 @@ def test_the_orientation_of_the_imu_tells_the_heading_if_asked_to(make, start, u
 
 
 @needs_ros
-def test_smoothed_odometry_comes_late_and_surer(make, drive):
+def test_smoothed_odometry_comes_late_and_surer(make):
     """With a lag, each position comes again: in order, at 50 Hz, not later than lag and window say, and surer."""
     inside = make("-p", "smoother.lag:=3.0")
+    drive = read_drive(50.0)
     begin = drive[0][0]
-    for second in range(25):
+    for second in range(51):
         inside.play([m for m in drive if begin + second * SECOND <= m[0] < begin + (second + 1) * SECOND])
         inside.report()
     name = next(topic for topic in inside.published if topic.endswith("odometry/smoothed"))
@@ -680,5 +681,6 @@ def test_smoothed_odometry_comes_late_and_surer(make, drive):
     assert 4 * SECOND < live["stamp"][-1] - smoothed["stamp"][-1] < 7 * SECOND
     _, first, second = np.intersect1d(live["stamp"], smoothed["stamp"], return_indices=True)
     variance = [rows["pose_covariance"].reshape(-1, 36)[i, 0] for rows, i in ((live, first), (smoothed, second))]
-    assert np.median(variance[1] / variance[0]) < 0.9
+    # The car stands for 20 s; then it needs some to find its heading.
+    assert np.median((variance[1] / variance[0])[-500:]) < 0.8
     assert make().node.fixed_lag is None
