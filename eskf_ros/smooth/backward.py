@@ -22,6 +22,7 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.inertial.covariance import update_error_axes
 from eskf_ros.filter.output.forward_log import (
     AFTER,
     BEFORE,
@@ -253,7 +254,7 @@ def go_before(p, node, row):
     for i in range(size):
         for j in range(size):
             p.added[i, j] = p.covariance[i, j]
-    turn_attitude(p.added, size, back)
+    update_error_axes(p.added, ATTITUDE, back)
     for i in range(size):
         for j in range(size):
             p.added[i, j] -= p.predicted[i, j]

@@ -1,9 +1,10 @@
 """The log of the forward pass, for a smoother: what the filter knew before and after the measurements of each stamp.
 
 Nothing is kept unless somebody asks for it (``settings.keeps_log``). A node is a stamp at which measurements changed
-the estimate, or `LONGEST_INTERVAL` after the last one: nominal state and covariance before and after them, the
-reset that turned the attitude error between, and the transition matrix of the errors from the node before. A point is the nominal state at an output stamp, before the
-measurements of that stamp. Where the log stands is part of the state, so a rewind takes back what it makes wrong.
+the estimate, or `LONGEST_INTERVAL` after the last one: nominal state and covariance before and after them, the matrix
+by which resets turned the attitude error in between, and the transition matrix of the errors from the node before. A
+point is the nominal state at an output stamp, before the measurements of that stamp. Where the log stands is part of
+the state, so a rewind takes back what it makes wrong.
 
 A smoother must not carry anything over a change that the transition does not describe. A node is linked to the one
 before if the estimate was only predicted in between, and continued if its measurements only updated it: no start, no
