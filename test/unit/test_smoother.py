@@ -84,6 +84,7 @@ class LinearCase:
         self.nodes = allocate(NODE, NODES)
         self.numbers = np.zeros((NODES, COVARIANCE_BEFORE + SIZE * (SIZE + 1)))
         self.after: list[Array] = []
+        self.resets: list[Array] = []
         # Rows of the least squares problem: coefficients of all errors of all nodes (scaled), and right sides.
         self.rows: list[Array] = []
         self.values: list[float] = []
@@ -139,11 +140,12 @@ class LinearCase:
             if k:
                 f, q = self.transition(numbers, size), self.spd(size, 0.5 * SCALE[:size])
                 kept = np.array([i for i in range(size) if k != RENEWED or i != ERROR_SIZE])
-                self.add_rows({k - 1: -f[kept], k: np.eye(size)[kept]}, np.zeros(len(kept)), q[np.ix_(kept, kept)])
+                # The errors that the transition carries are those whose axes the reset has turned.
+                turned, offset = f @ self.reset[:size, :size], f @ (x - self.reset[:size, :size] @ x)
+                self.add_rows({k - 1: -turned[kept], k: np.eye(size)[kept]}, offset[kept], q[np.ix_(kept, kept)])
                 x, p = f @ x, f @ p @ f.T + q
             node["stamp"], node["is_linked"], node["is_continued"] = k, k > 0, k > 0
             node["has_before"] = node["has_after"] = 1
-            numbers[RESET : RESET + 9] = np.eye(3).ravel()
             node["size_before"] = size
             put_nominal(numbers, BEFORE, x)
             numbers[COVARIANCE_BEFORE : COVARIANCE_BEFORE + size * (size + 1) // 2] = triangle(p)
@@ -156,6 +158,11 @@ class LinearCase:
             x = x + gain @ (z - h @ x)
             rest = np.eye(size) - gain @ h
             p = rest @ p @ rest.T + gain @ r @ gain.T
+            self.reset = np.eye(SIZE)
+            self.reset[6:9, 6:9] += 0.2 * self.random.normal(size=(3, 3))
+            self.resets.append(self.reset[:ERROR_SIZE, :ERROR_SIZE])
+            numbers[RESET : RESET + 9] = self.reset[6:9, 6:9].ravel()
+            p = self.reset[:size, :size] @ p @ self.reset[:size, :size].T
             node["size_after"] = size
             put_nominal(numbers, AFTER, x)
             after = (COVARIANCE_BEFORE + len(numbers)) // 2
@@ -176,16 +183,17 @@ class LinearCase:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_equal_to_least_squares_over_all_nodes(seed: int) -> None:
-    """With states that join and one that is renewed in between, to 1e-9 of a standard deviation."""
+    """With states that join, one that is renewed and axes that are turned in between, to 1e-9 standard deviations."""
     case = LinearCase(seed)
     expected, covariance = case.solution()
     smooth_nodes(case.nodes, case.numbers, allocate(PASS), CLOCK)
     scale = SCALE[:ERROR_SIZE]
     for k in range(NODES):
         numbers = case.numbers[k]
-        found = (case.after[k][:ERROR_SIZE] + numbers[CORRECTION_AFTER : CORRECTION_AFTER + ERROR_SIZE]) / scale
+        back = np.linalg.inv(case.resets[k])
+        found = (case.after[k][:ERROR_SIZE] + back @ numbers[CORRECTION_AFTER : CORRECTION_AFTER + ERROR_SIZE]) / scale
         np.testing.assert_allclose(found, expected[k], atol=1e-9 * np.sqrt(np.diag(covariance[k])).max())
-        spread = matrix_of(numbers, SMOOTHED_AFTER, ERROR_SIZE) / scale / scale[:, None]
+        spread = back @ matrix_of(numbers, SMOOTHED_AFTER, ERROR_SIZE) @ back.T / scale / scale[:, None]
         np.testing.assert_allclose(spread, covariance[k], atol=1e-9 * np.abs(covariance[k]).max())
 
 
@@ -228,6 +236,14 @@ def joined(logs: list[Log]) -> Log:
     return Log(*(np.concatenate([log[i] for log in logs]) for i in range(3)))
 
 
+def whole_log(navigator: Navigator, smoother: Smoother) -> Log:
+    """What was collected of the nodes, and the rest of them."""
+    log = joined(navigator.take_log(True))
+    nodes, numbers = smoother._nodes, smoother._numbers
+    assert numbers is not None
+    return joined([Log(nodes.read(0, len(nodes)), numbers.read(0, len(nodes)), log.points[:0]), log])
+
+
 def backward_information(log: Log, first: int) -> tuple[Array, Array]:
     """Information of all measurements after node ``first`` on its errors: matrix and vector.
 
@@ -263,17 +279,56 @@ def backward_information(log: Log, first: int) -> tuple[Array, Array]:
     return matrix, vector
 
 
+def test_the_log_is_what_the_filter_did(drive: Recording) -> None:
+    """The logged transition and reset make the covariances of the filter out of each other.
+
+    What a smoother of an older filter believes of F or of the reset shows here: the process noise of an interval is
+    that of the parameters, and what one position takes from the covariance follows from what it takes from the position
+    alone. Both in standard deviations, on a drive with turns whose heading is corrected by many of them.
+    """
+    changes = {"gnss.use_velocity": False, "gnss.lever_arm": (0.0, 0.0, 0.0)}
+    log = whole_log(*logged(drive, changes))
+    half = (COVARIANCE_BEFORE + log.numbers.shape[1]) // 2
+    parameters = from_mapping({**drive.parameters(), **changes}).imu
+    turned, compared, intervals = 0.0, 0, 0
+    for k in range(1, len(log.nodes)):
+        numbers, seconds = log.numbers[k], (log.nodes["stamp"][k] - log.nodes["stamp"][k - 1]) * 1e-9
+        before, after = matrix_of(numbers, COVARIANCE_BEFORE, 15), matrix_of(numbers, half, 15)
+        if log.nodes["is_linked"][k] and seconds < 0.3:
+            f = np.eye(15)
+            f[:9] = numbers[TRANSITION:FADE].reshape(9, 15)
+            noise = before - f @ matrix_of(log.numbers[k - 1], half, 15) @ f.T
+            sigma = np.sqrt(np.diag(before))
+            expected = np.zeros(15)
+            expected[3:6] = parameters.accel_noise_density**2 * seconds
+            expected[6:9] = parameters.gyro_noise_density**2 * seconds
+            expected[9:12] = parameters.accel_bias_random_walk**2 * seconds
+            expected[12:15] = parameters.gyro_bias_random_walk**2 * seconds
+            np.testing.assert_allclose(np.diag(noise)[3:], expected[3:], rtol=0.02, atol=0.0)
+            # In so short a time the noise of the gyro hardly enters the velocity.
+            assert np.abs(noise[3:6, 6:9] / sigma[3:6, None] / sigma[6:9]).max() < 1e-4
+            intervals += 1
+        if log.nodes["is_continued"][k] and not np.array_equal(before[:3, :3], after[:3, :3]):
+            back = np.eye(15)
+            back[6:9, 6:9] = np.linalg.inv(numbers[RESET : RESET + 9].reshape(3, 3))
+            sigma = np.sqrt(np.diag(before))
+            taken = before - back @ after @ back.T
+            root = np.linalg.solve(before[:3, :3], before[:3])
+            by_position = root.T @ taken[:3, :3] @ root
+            np.testing.assert_allclose(taken / sigma / sigma[:, None], by_position / sigma / sigma[:, None], atol=1e-7)
+            turned = max(turned, np.abs(back - np.eye(15)).max())
+            compared += 1
+    assert min(compared, intervals) > 200
+    assert turned > 1e-3
+
+
 def test_equal_to_a_filter_from_the_other_end(drive: Recording) -> None:
     """The whole filter on a drive, positions only, to a hundredth of a standard deviation.
 
     Its estimate and that from the other end are combined. Corrections are up to 60 standard deviations here; where
     rotations are composed in another order they differ in second order.
     """
-    navigator, smoother = logged(drive, {"gnss.use_velocity": False, "gnss.lever_arm": (0.0, 0.0, 0.0)})
-    log = joined(navigator.take_log(True))
-    nodes, numbers = smoother._nodes, smoother._numbers
-    assert numbers is not None
-    log = joined([Log(nodes.read(0, len(nodes)), numbers.read(0, len(nodes)), log.points[:0]), log])
+    log = whole_log(*logged(drive, {"gnss.use_velocity": False, "gnss.lever_arm": (0.0, 0.0, 0.0)}))
     half = (COVARIANCE_BEFORE + log.numbers.shape[1]) // 2
     smoothed = log.numbers.copy()
     smooth_nodes(log.nodes, smoothed, allocate(PASS), 36)
