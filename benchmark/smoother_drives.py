@@ -21,6 +21,8 @@ sys.path.insert(0, str(ROOT / "test"))
 
 from eskf_ros.replay.main import main as replay  # noqa: E402
 from support.data import find_data_folder  # noqa: E402
+from support.recordings.car_ontario import DRIVES, car_ontario_recording  # noqa: E402
+from support.recordings.car_ontario import OUTAGE_SETS as ONTARIO_OUTAGES  # noqa: E402
 from support.recordings.common import Outages, Recording, results_folder  # noqa: E402
 from support.recordings.drive_0708 import OUTAGE_SETS as RURAL_OUTAGES  # noqa: E402
 from support.recordings.drive_0708 import drive_0708_recording  # noqa: E402
@@ -36,12 +38,13 @@ WITHOUT_VELOCITY = "gnss.use_velocity: false"
 
 
 class Row(NamedTuple):
-    """Largest errors (m) inside outages by filter and smoother, 50 % and 95 %; their number, breaks of the smoother."""
+    """Largest errors (m) inside outages by filter and smoother, 50 % and 95 %; their number, breaks and resets."""
 
     filter: tuple[float, float]
     smoother: tuple[float, float]
     count: int
     breaks: int
+    resets: int
 
 
 def smoothed_summary(recording: Recording, *lines: str, outages: Outages = ()) -> dict[str, Any]:
@@ -55,20 +58,26 @@ def smoothed_summary(recording: Recording, *lines: str, outages: Outages = ()) -
 
 def inside_outages(recording: Recording, sets: tuple[Outages, ...], *lines: str) -> Row:
     """Replay with each set of outages; largest horizontal errors inside them."""
+    return inside_outages_of([(recording, sets)], *lines)
+
+
+def inside_outages_of(recordings: list[tuple[Recording, tuple[Outages, ...]]], *lines: str) -> Row:
+    """Replay each recording with each of its sets of outages; largest horizontal errors inside all of them."""
     errors: dict[str, list[float]] = {"filter": [], "smoother": []}
-    breaks = 0
-    for outages in sets:
+    breaks = resets = 0
+    for recording, outages in [(recording, outages) for recording, sets in recordings for outages in sets]:
         summary = smoothed_summary(recording, *lines, outages=outages)
         breaks += summary["smoothed"]["breaks"]
+        resets += summary["smoothed"]["resets"]
         for name, found in (("filter", summary), ("smoother", summary["smoothed"])):
             errors[name] += [o["horizontal_max"] for o in found["outages"] if o["horizontal_max"] is not None]
     half_and_most = [tuple(np.percentile(errors[name], [50.0, 95.0]).tolist()) for name in ("filter", "smoother")]
-    return Row(*half_and_most, len(errors["smoother"]), breaks)
+    return Row(*half_and_most, len(errors["smoother"]), breaks, resets)
 
 
 def main() -> int:
     """Replay all drives and write the table."""
-    lines = ["| drive | outages | filter | smoother | breaks | bar |", "|---|---|---|---|---|---|"]
+    lines = ["| drive | outages | filter | smoother | breaks, resets | bar |", "|---|---|---|---|---|---|"]
     passed = True
     with tempfile.TemporaryDirectory() as folder:
         rural = drive_0708_recording(Path(folder), find_data_folder("drive_0708"), False)
@@ -99,8 +108,19 @@ def main() -> int:
             passed &= good
             lines.append(
                 f"| {label} | {row.count} of {sets[0][0][1]:g} s | {row.filter[0]:.2f}, {row.filter[1]:.2f} m "
-                f"| {row.smoother[0]:.2f}, {row.smoother[1]:.2f} m | {row.breaks} "
+                f"| {row.smoother[0]:.2f}, {row.smoother[1]:.2f} m | {row.breaks}, {row.resets} "
                 f"| {bar[0]}, {bar[1]}: {'pass' if good else 'MISSED'} |"
+            )
+            print(lines[-1], flush=True)
+        ontario = [
+            (car_ontario_recording(Path(folder), find_data_folder("car_ontario"), name), ONTARIO_OUTAGES[name])
+            for name in DRIVES
+        ]
+        for label, changes in (("car_ontario, seven drives", ()), ("car_ontario, seven drives, with NHC", (NHC,))):
+            row = inside_outages_of(ontario, *changes)
+            lines.append(
+                f"| {label} | {row.count} of 30 s | {row.filter[0]:.2f}, {row.filter[1]:.2f} m "
+                f"| {row.smoother[0]:.2f}, {row.smoother[1]:.2f} m | {row.breaks}, {row.resets} | none |"
             )
             print(lines[-1], flush=True)
         for with_velocity in (False, True):
@@ -110,7 +130,7 @@ def main() -> int:
             passed &= smoothed <= 0.5 * by_filter
             lines.append(
                 f"| KITTI, {fixes} every 10 s, rms of all | | {by_filter:.2f} m "
-                f"| {smoothed:.2f} m | {summary['smoothed']['breaks']} "
+                f"| {smoothed:.2f} m | {summary['smoothed']['breaks']}, {summary['smoothed']['resets']} "
                 f"| half: {'pass' if smoothed <= 0.5 * by_filter else 'MISSED'} |"
             )
             print(lines[-1], flush=True)
