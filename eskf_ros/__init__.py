@@ -1,7 +1,7 @@
 """Error-state Kalman filter fusing an IMU with GNSS: a ROS 2 package and a replay tool for recordings.
 
-For arrays in memory, imported when they are asked for: `run`, `Filter` and `Result` of `eskf_ros.api`; `read_bag`, a
-recording as tables; `check`, what is wrong with a recording; `calibrate`, how the sensors are installed;
+For arrays in memory, imported when they are asked for: `run`, `Filter`, `Result` and `Smoothed` of `eskf_ros.api`;
+`read_bag`, a recording as tables; `check`, what is wrong with a recording; `calibrate`, how the sensors are installed;
 `load_parameters`, a ROS 2 parameter file.
 """
 
@@ -11,13 +11,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from eskf_ros.api import Filter, Result, run
+    from eskf_ros.api import Filter, Result, Smoothed, run
     from eskf_ros.calibration.calibrate import calibrate
     from eskf_ros.doctor.examine import check
     from eskf_ros.parameters.ros_yaml import load as load_parameters
     from eskf_ros.tables.bag import read_bag
 
-__all__ = ["Filter", "Result", "__version__", "calibrate", "check", "load_parameters", "read_bag", "run"]
+__all__ = ["Filter", "Result", "Smoothed", "__version__", "calibrate", "check", "load_parameters", "read_bag", "run"]
 
 __version__ = "0.1.0"
 
@@ -25,6 +25,7 @@ _HOMES = {
     "Filter": "eskf_ros.api.Filter",
     "Result": "eskf_ros.api.Result",
     "calibrate": "eskf_ros.calibration.calibrate.calibrate",
+    "Smoothed": "eskf_ros.api.Smoothed",
     "check": "eskf_ros.doctor.examine.check",
     "run": "eskf_ros.api.run",
     "load_parameters": "eskf_ros.parameters.ros_yaml.load",

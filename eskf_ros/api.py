@@ -29,8 +29,9 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -51,12 +52,13 @@ from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.parameters.ros_yaml import load
 from eskf_ros.parameters.tree import Parameters
 from eskf_ros.replay.summary import final_result
+from eskf_ros.smooth.smoother import Smoother
 from eskf_ros.tables.columns import Array, Stamps, Table, in_order
 from eskf_ros.tables.eras import eras_of
 from eskf_ros.tables.feeding import WIDTH, push_row
-from eskf_ros.tables.results import aid_summary, as_table, innovation_table, trajectory_table
+from eskf_ros.tables.results import aid_summary, bias_table, innovation_table, trajectory_table
 
-__all__ = ["Filter", "Result", "run"]
+__all__ = ["Filter", "Result", "Smoothed", "run"]
 
 ParametersLike = str | PathLike[str] | Parameters | Mapping[str, object] | None
 
@@ -114,6 +116,8 @@ class Result:
             ``final`` state.
         odometry: the rows of the trajectory as the filter gives them (``filter.output.global_odometry.ODOMETRY``), with
             covariances.
+
+    `smooth` gives the best trajectory afterwards.
     """
 
     trajectory: Any
@@ -122,6 +126,35 @@ class Result:
     warnings: list[str]
     summary: dict[str, Any]
     odometry: NDArray[Any]
+    _smoother: Callable[[], tuple[Smoother, tuple[float, float, float] | None]] | None = None
+
+    def smooth(self) -> Smoothed:
+        """Return the smoothed trajectory: each moment from the measurements before and after it.
+
+        A result of `run` runs the filter once more for it.
+
+        Raises:
+            ValueError: the `Filter` was made without ``smooth=True``, so that it has kept no log.
+        """
+        if self._smoother is None:
+            raise ValueError("the filter kept no log to smooth: make it with Filter(..., smooth=True)")
+        smoother, datum = self._smoother()
+        rows = np.frombuffer(b"".join(part.tobytes() for part in smoother.rows()), ODOMETRY)
+        return Smoothed(trajectory_table(rows, datum), bias_table(rows), rows, smoother.breaks)
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """The smoothed trajectory; ``trajectory``, ``biases`` and ``odometry`` as in `Result`, where the position is known.
+
+    ``breaks``: starts of the filter, over which nothing is smoothed. Status and quality are those of the filter; there
+    is no pose in odom.
+    """
+
+    trajectory: Any
+    biases: Any
+    odometry: NDArray[Any]
+    breaks: int
 
 
 class Filter:
@@ -131,11 +164,12 @@ class Filter:
     set back is recognised within one table, or between two updates.
     """
 
-    def __init__(self, parameters: ParametersLike = None, output_rate: float = 0.0) -> None:
+    def __init__(self, parameters: ParametersLike = None, output_rate: float = 0.0, smooth: bool = False) -> None:
         """Prepare a filter.
 
         ``parameters``: a ROS parameter file, `Parameters`, or a mapping with the names of the file, nested or dotted;
-        None: the defaults. ``output_rate`` (Hz) of the trajectory; 0: every IMU sample.
+        None: the defaults. ``output_rate`` (Hz) of the trajectory; 0: every IMU sample. ``smooth``: keep what
+        `Result.smooth` needs, in a temporary file.
 
         Raises:
             ParameterError: the parameters cannot be used.
@@ -145,7 +179,8 @@ class Filter:
         if not (math.isfinite(output_rate) and output_rate >= 0.0):
             raise ValueError(f"output_rate is {output_rate!r}: give Hz from 0 on, 0 for every IMU sample")
         self._parameters = _parameters(parameters)
-        self._navigator = Navigator(self._parameters, output_rate)
+        self._navigator = Navigator(self._parameters, output_rate, keeps_log=smooth)
+        self._smoother = Smoother(self._navigator) if smooth else None
         self._imu_parts: list[tuple[Stamps, Array]] = []
         self._aid_parts: dict[str, list[tuple[Stamps, Array]]] = {name: [] for name in _KINDS}
         self._spans: dict[str, tuple[int, int]] = {}
@@ -246,6 +281,8 @@ class Filter:
             self._give(aids[given:until], previous is None)
             rows.append(self._navigator.update() if is_jump else self._navigator.push_imu(*chunk))
             self._records.append(self._navigator.take_records())
+            if self._smoother is not None:
+                self._smoother.collect()
             given, first = until, end
         self._give(aids[given:], False)
         rows.append(self._navigator.update())
@@ -264,7 +301,8 @@ class Filter:
             for stamp in stamps.tolist()
         ]
         # Only a copy is finished: the filter itself can go on.
-        last = copy.deepcopy(navigator).finish()
+        finished = copy.deepcopy(navigator)
+        last = finished.finish()
         records = np.concatenate([np.zeros(0, RECORD), *self._records, last, *waiting])
         records = records[np.lexsort((records["source"], records["stream"], records["stamp"]))]
         rows = np.frombuffer(b"".join(part.tobytes() for part in self._rows), ODOMETRY)
@@ -284,12 +322,11 @@ class Filter:
         return Result(
             trajectory_table(rows, navigator.datum),
             innovation_table(records),
-            as_table(
-                {name: rows[name] for name in ("stamp", "accel_bias", "gyro_bias", "accel_bias_std", "gyro_bias_std")}
-            ),
+            bias_table(rows),
             [*navigator.complaints, *navigator.notes, *self._drops(summary)],
             summary,
             rows,
+            None if self._smoother is None else partial(_smoothed, self._smoother.copied_for(finished), finished),
         )
 
     def _refuse_apart(self) -> None:
@@ -434,13 +471,33 @@ def run(
         "baro": baro,
         **others,
     }
-    runner = Filter(parameters, output_rate)
+    result = _run(imu, tables, parameters, output_rate, False)
+    return replace(result, _smoother=partial(_run_again, imu, tables, parameters, output_rate))
+
+
+def _run(imu: Any, tables: Mapping[str, Any], parameters: ParametersLike, output_rate: float, smooth: bool) -> Result:
+    runner = Filter(parameters, output_rate, smooth)
     runner.push_imu(imu)
     for name, table in tables.items():
         if table is not None:
             runner.push(name, table)
     runner._refuse_apart()
     return runner.result()
+
+
+def _run_again(
+    imu: Any, tables: Mapping[str, Any], parameters: ParametersLike, output_rate: float
+) -> tuple[Smoother, tuple[float, float, float] | None]:
+    """Return the smoother of the same run, and its datum."""
+    again = _run(imu, tables, parameters, output_rate, True)._smoother
+    assert again is not None
+    return again()
+
+
+def _smoothed(smoother: Smoother, finished: Navigator) -> tuple[Smoother, tuple[float, float, float] | None]:
+    """Return a smoother that has smoothed up to the end of ``finished``, and the datum."""
+    smoother.smooth()
+    return smoother, finished.datum
 
 
 def _end_of_chunk(stamps: Stamps, first: int, is_jump: bool) -> int:

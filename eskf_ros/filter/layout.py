@@ -31,6 +31,7 @@ from eskf_ros.filter.integrity.recovery import RECOVERY
 from eskf_ros.filter.integrity.repeated_fixes import REPEATED_FIXES
 from eskf_ros.filter.integrity.scatter import SCATTER
 from eskf_ros.filter.measurements.mag import EARTH_FIELD
+from eskf_ros.filter.output.forward_log import FORWARD
 from eskf_ros.filter.output.local_odometry import STEP
 from eskf_ros.filter.rows import ROWS
 from eskf_ros.filter.state.enums import Stream
@@ -108,6 +109,7 @@ STATE = np.dtype(
         ("streams", STREAMS),
         ("scatter", SCATTER),
         ("repeats", REPEATED_FIXES),
+        ("forward", FORWARD),
     ],
     align=True,
 )
@@ -165,6 +167,8 @@ SETTINGS = np.dtype(
         ("remembered_forward_ecef", "f8", (3,)),
         ("remembered_heading_std", "f8"),
         ("output_interval", "i8"),
+        ("keeps_log", "i8"),
+        ("error_capacity", "i8"),
         *((f"{name}_at", "i8") for name in OPTIONAL_SIZES),
         *((row.name, row.settings) for row in ROWS if row.settings.names),
         ("optional_std", "f8", (OPTIONAL_CAPACITY,)),
@@ -177,6 +181,7 @@ SETTINGS = np.dtype(
 
 ``humble_noise``: spectral densities of the humble lane (`predict.imu_noise`);
 ``has_humble_lane``: 1, but 0 where a campaign compares with a filter that trusts itself.
+``keeps_log``: whether the forward pass is logged. ``error_capacity``: errors that can come into use.
 ``reach``: errors that must be active for a measurement of a stream. ``constrains``: which constraints are switched on.
 ``needs``: what must be known before a measurement of a stream is fused. ``NAME_at``: index of an augmented state, or
 `NOWHERE`. ``optional_*``, from the first index behind the core: initial standard deviation, process noise density
@@ -270,6 +275,7 @@ _NEVER = {
         "fused_since",
     ),
     "repeats": ("fix_stamp",),
+    "forward": ("node_stamp", "breaks", "given_stamp"),
     "receiver": (
         "departure_stamp",
         "seen_stamp",
@@ -292,6 +298,8 @@ def blank_state() -> np.ndarray:
     state["quality"]["least_jump"] = np.repeat((LEAST_FORCE_JUMP**2, LEAST_RATE_JUMP**2), 3)
     state["quality"]["lowest"], state["quality"]["highest"] = np.inf, -np.inf
     state["attitude"][:, 0] = 1.0
+    state["forward"]["transition"], state["forward"]["reset"] = np.eye(ERROR_SIZE), np.eye(3)
+    state["forward"]["fade"] = 1.0
     state["levelling"]["kept_gyro_variance"] = np.inf
     state["error_size"] = ERROR_SIZE
     # Longer than any gap: the first interval is integrated without a curvature from an earlier one.

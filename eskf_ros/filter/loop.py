@@ -12,6 +12,7 @@ from eskf_ros.filter.inertial.stamps import take_stamp
 from eskf_ros.filter.inertial.strapdown import SMOOTHING_TIME
 from eskf_ros.filter.integrity.imu_monitor import watch_input, watch_interval
 from eskf_ros.filter.integrity.restart import reset_alignment
+from eskf_ros.filter.output.forward_log import close_node, log_sample, open_node
 from eskf_ros.filter.output.global_odometry import write_odometry
 from eskf_ros.filter.output.local_odometry import carry, measure_step, note_jump
 from eskf_ros.filter.predict import propagate
@@ -27,7 +28,7 @@ LONGEST_GAP = 5 * SECOND
 
 
 @njit
-def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, locals_, rows):
+def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, locals_, rows, log):
     """Run the filter over all waiting messages in the total order; return the number of rows written.
 
     One row is written for every IMU sample that is new and is the first on the output grid.
@@ -43,10 +44,10 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
         judge_sample(state, sample, instant, settings)
 
         while state.aid_next < t.aid_count and aids[state.aid_next].stamp < instant:
-            predict(states, aids[state.aid_next].stamp, sample, instant, settings, work)
-            state.aid_next = fuse_next(states, aids, t.aid_count, settings, work)
+            predict(states, aids[state.aid_next].stamp, sample, instant, settings, work, log)
+            state.aid_next = fuse_next(states, aids, t.aid_count, settings, work, log)
 
-        predict(states, instant, sample, instant, settings, work)
+        predict(states, instant, sample, instant, settings, work, log)
         take_sample(state, sample, instant)
         if is_running(states):
             take_sample(states[HUMBLE], sample, instant)
@@ -54,6 +55,9 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
         measure_step(state, settings)
         update_rest(state, settings)
         add_to_block(state, settings)
+        is_due = is_on_grid(previous_stamp, sample.stamp, settings.output_interval)
+        if settings.keeps_log == 1:
+            log_sample(state, log, is_due, settings)
         save_checkpoint(states, checkpoints, t)
 
         is_new = sample.stamp > t.published and state.level_known == 1
@@ -61,9 +65,9 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
             carry(local, state, settings)
 
         while state.aid_next < t.aid_count and aids[state.aid_next].stamp == instant:
-            state.aid_next = fuse_next(states, aids, t.aid_count, settings, work)
+            state.aid_next = fuse_next(states, aids, t.aid_count, settings, work, log)
 
-        if is_new and is_on_grid(previous_stamp, sample.stamp, settings.output_interval):
+        if is_new and is_due:
             write_odometry(state, local, settings, rows[row_count])
             row_count += 1
         t.published = max(t.published, sample.stamp)
@@ -71,7 +75,7 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
 
 
 @njit
-def predict(states, stamp, sample, instant, settings, work):
+def predict(states, stamp, sample, instant, settings, work, log):
     """Propagate the lanes to ``stamp`` (ns), at or before the next IMU sample, which is of the time ``instant`` (ns).
 
     After a long silence of the IMU the alignment starts again.
@@ -81,7 +85,11 @@ def predict(states, stamp, sample, instant, settings, work):
         return
     if instant - state.imu.stamp > LONGEST_GAP:
         position = (state.position_map[0], state.position_map[1], state.position_map[2])
+        if settings.keeps_log == 1:
+            open_node(state, log)
         reset_alignment(state)
+        if settings.keeps_log == 1:
+            close_node(state, log, True, settings)
         note_jump(state, position, heading_of(state, settings), settings)
         return
     propagate(state, stamp, sample, instant, settings, work)
@@ -123,15 +131,20 @@ def take_sample(state, sample, instant):
 
 
 @njit_in_caller
-def fuse_next(states, aids, count, settings, work):
+def fuse_next(states, aids, count, settings, work, log):
     """Fuse the next of ``count`` measurements, or all signals of its epoch; return the index of the next one."""
     state = states[FILTER]
     i = state.aid_next
-    if not is_range(aids[i].stream):
+    end = i + 1
+    if settings.keeps_log == 1 and state.forward.is_open == 0:
+        open_node(state, log)
+    if is_range(aids[i].stream):
+        end = end_of_epoch(aids, i, count)
+        fuse_ranges(states, aids, i, end, settings, work)
+    else:
         fuse(states, aids, i, settings, work)
-        return i + 1
-    end = end_of_epoch(aids, i, count)
-    fuse_ranges(states, aids, i, end, settings, work)
+    if settings.keeps_log == 1 and (end == count or aids[end].stamp != aids[i].stamp):
+        close_node(state, log, False, settings)
     return end
 
 

@@ -33,6 +33,7 @@ from eskf_ros.filter.loop import advance
 from eskf_ros.filter.measurements import heading, mag
 from eskf_ros.filter.measurements.gnss_position import NO_ALTITUDE, UNKNOWN_ALTITUDE_VARIANCE
 from eskf_ros.filter.measurements.heading import UNKNOWN_ANGLE_VARIANCE
+from eskf_ros.filter.output.forward_log import Log, allocate_log, grown, log_end, take_log
 from eskf_ros.filter.output.global_odometry import ODOMETRY
 from eskf_ros.filter.output.local_odometry import LOCAL, note_jump
 from eskf_ros.filter.readout import Readout
@@ -85,9 +86,13 @@ class Navigator(Readout):
     rows (ODOMETRY), `history.records` those of records (RECORD).
     """
 
-    def __init__(self, parameters: Parameters, output_rate: float = 0.0) -> None:
-        """Prepare a filter; ``output_rate`` (Hz) of the rows that `push_imu` returns, 0 for every IMU sample."""
+    def __init__(self, parameters: Parameters, output_rate: float = 0.0, keeps_log: bool = False) -> None:
+        """Prepare a filter; ``output_rate`` (Hz) of the rows that `push_imu` returns, 0 for every IMU sample.
+
+        ``keeps_log``: keep the log of the forward pass for a smoother, who has to call `take_log` now and then.
+        """
         self._output_rate = output_rate
+        self._keeps_log = keeps_log
         self._buffers = Buffers(STATE, ODOMETRY)
         self._work = allocate(WORK)
         self._offered = allocate(AID)
@@ -99,6 +104,7 @@ class Navigator(Readout):
         """Use other parameters from now on; they also apply to messages of the window that are applied again."""
         self.parameters = parameters
         self._settings = settings_from(parameters, self._output_rate)
+        self._settings["keeps_log"] = self._keeps_log
         self._constraint_count = int(self._settings["constrains"].sum())
         self._intakes = intakes_from(parameters)
         self.needs_field = parameters.mag.use or parameters.alignment.imu_orientation == "magnetic_north"
@@ -121,6 +127,8 @@ class Navigator(Readout):
         self._local = allocate(LOCAL)
         self._refused: list[np.ndarray] = []
         self._traffic = Traffic()
+        self._log = allocate_log(int(self._settings["error_capacity"][0]) if self._keeps_log else 0, 0, 0)
+        self._taken_log: list[Log] = []
         self._clock = ClockSteps()
         self.range_statuses: Counter[RangeStatus] = Counter()
         """Number of signals by status: usable, or why they never entered the timeline."""
@@ -295,6 +303,7 @@ class Navigator(Readout):
             self._work,
             self._local,
             self._buffers.rows,
+            self._log,
         )
         return copied(self._buffers.rows, count)
 
@@ -471,6 +480,23 @@ class Navigator(Readout):
         """Return the records (RECORD) that became final since the last call: in the total order, the late ones last."""
         return self._given_out(self._take_records(False))
 
+    def take_log(self, everything: bool = False) -> list[Log]:
+        """Return what became final of the log of the forward pass since the last call, in parts in their order.
+
+        ``everything``: up to the newest IMU sample, after `finish`; nothing can be pushed afterwards.
+        """
+        if everything:
+            log_end(self._states[0], self._log, self._settings[0])
+        self._drain_log(everything)
+        taken, self._taken_log = self._taken_log, []
+        return taken
+
+    def _drain_log(self, everything: bool) -> None:
+        """Move what is final from the buffers of the log to what will be taken."""
+        if self._keeps_log:
+            buffers = self._buffers
+            self._taken_log.append(take_log(self._log, self._states, buffers.checkpoints, buffers.timeline, everything))
+
     def take_live(self) -> np.ndarray:
         """Return the records of what was judged since the last call, as they stand: a late message may change them."""
         judged = self._buffers.aids[: int(self._states["aid_next"][0])]
@@ -587,6 +613,7 @@ class Navigator(Readout):
         if self._buffers.timeline["frontier"][0] != NEVER:
             records = self._take_records(True)
             self._refused.append(records)
+            self._drain_log(True)
         raise_barrier(self._states, self._blank, self._buffers.timeline)
 
     def _take_records(self, everything: bool) -> np.ndarray:
@@ -601,6 +628,7 @@ class Navigator(Readout):
     def _forget(self) -> None:
         """Process what waits, and drop what no accepted message can change any more."""
         self._advance()
+        self._drain_log(False)
         self._buffers.forget(self._states)
 
     def _make_room(self, aids: int = 1) -> None:
@@ -608,3 +636,7 @@ class Navigator(Readout):
         if not self._buffers.have_room(aids, self._constraint_count):
             self._forget()
             self._buffers.grow(aids, self._constraint_count)
+        if self._keeps_log:
+            # A node has a measurement or an IMU sample of its own, a point an IMU sample.
+            samples = len(self._buffers.imu)
+            self._log = grown(self._log, samples + len(self._buffers.aids) + 1, samples)

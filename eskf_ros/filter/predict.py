@@ -11,6 +11,7 @@ from eskf_ros.filter.inertial.covariance import (
     propagate_noise,
 )
 from eskf_ros.filter.inertial.strapdown import propagate_nominal_state
+from eskf_ros.filter.output.forward_log import carry_transition
 from eskf_ros.filter.state import augmented_states
 from eskf_ros.filter.state.error_state import ERROR_SIZE
 from eskf_ros.filter.state.time import SECOND
@@ -56,6 +57,8 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
     force = credible_force(state.excitation, covariance, middle, force, gravity, dt, settings.accel_noise_density)
     augmented_states.propagate_scale(state, middle, force_1, rate_1, dt, coupling, settings)
     propagate_covariance(covariance, size, middle, force, gravity, state.frame.earth_rate_map, dt, coupling, work)
+    if settings.keeps_log == 1:
+        carry_transition(state, middle, force, gravity, dt, coupling, settings)
     propagate_noise(covariance, velocity_noise, attitude_noise, accel_walk, gyro_walk, dt)
     if state.quality.is_doubted == 1:
         propagate_axis_noise(covariance, middle, state.quality.doubt, dt)

@@ -52,6 +52,10 @@ class Readout:
         """A copy of the whole state (STATE, array of length one), in times of the timeline (`history.clock_steps`)."""
         return np.array(self._states[:1], STATE)
 
+    def stamps_of(self, times: np.ndarray) -> np.ndarray:
+        """Return the stamps (ns) that times (n,) of the timeline had on the clock of then (`history.clock_steps`)."""
+        return self._clock.stamps_of(times)
+
     @property
     def status(self) -> Status:
         """The `Status` at the newest IMU sample."""

@@ -150,6 +150,7 @@ def place_optional_states(settings: np.void, parameters: Parameters) -> None:
         end += size
         for stream in block.streams:
             settings["reach"][stream] = end
+    settings["error_capacity"] = end
 
 
 def optional_blocks(parameters: Parameters) -> tuple[OptionalBlock, ...]:

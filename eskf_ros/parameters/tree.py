@@ -450,6 +450,18 @@ class History:
 
 
 @dataclass(frozen=True)
+class Smoother:
+    lag: float = parameter(
+        0.0,
+        "s",
+        "Publish odometry/smoothed: each estimate again when the measurements of this many seconds after it have come. "
+        "It comes history.window later still. 0: off.",
+        minimum=0.0,
+        maximum=600.0,
+    )
+
+
+@dataclass(frozen=True)
 class Alignment:
     initial_heading_deg: float = parameter(
         math.nan,
@@ -672,6 +684,7 @@ class Parameters:
     ranges: Ranges = group_of(Ranges, "What a GNSS receiver measures of each satellite: pseudorange and Doppler.")
     estimate: Estimate = group_of(Estimate, "What is estimated besides the motion and the biases of the IMU.")
     history: History = group_of(History, "Late and out-of-order messages.")
+    smoother: Smoother = group_of(Smoother, "The smoothed trajectory of the node, late and better.")
     alignment: Alignment = group_of(Alignment, "Start-up: levelling, heading, and when the estimate is called good.")
     quality: Quality = group_of(Quality, "When the estimate is called usable (eskf/quality).")
     warm_start: WarmStart = group_of(WarmStart, "What the node remembers of its last run.")

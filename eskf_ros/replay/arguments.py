@@ -13,6 +13,8 @@ _EPILOG = """\
 results, in DIR/<bag name>_eskf/ (files of an earlier replay are replaced):
   odometry.mcap   odometry, fixes, verdicts, biases, diagnostics, path and truth, for Foxglove and others
   trajectory.tum  t x y z qx qy qz qw: base_link in map as it was published at that time, from the first known position
+  trajectory_smoothed.tum  with --smooth: the same trajectory as it is known afterwards; in odometry.mcap as
+                  odometry/smoothed
   aids.csv        one line per GNSS message or signal: stamp, arrival, aid, innovation, NIS, degrees of freedom, verdict
   details.npz     what only a report needs: biases, states, errors, fixes and the IMU by the second
   summary.json    everything in numbers
@@ -128,6 +130,11 @@ def parser() -> argparse.ArgumentParser:
         choices=("log", "stamp"),
         default="log",
         help="give messages as they were recorded, or sorted by stamp within 10 s (default: %(default)s)",
+    )
+    options.add_argument(
+        "--smooth",
+        action="store_true",
+        help="afterwards go back over the recording: the best trajectory, from what came before and after each moment",
     )
     options.add_argument(
         "--output-rate",

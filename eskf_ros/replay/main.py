@@ -134,6 +134,7 @@ def _wanted(folder: Path, options: argparse.Namespace) -> Options:
         outages=tuple(options.outage),
         mode=options.mode,
         order=options.order,
+        smooth=options.smooth,
         output_rate=options.output_rate,
         ranges=options.ranges,
         navigation=tuple(options.nav),
@@ -221,15 +222,17 @@ def _show(summary: dict[str, Any], folder: Path, report: Path | None, to_stderr:
     )
     if "ranges" in summary:
         console.print(f"Epochs of ranges: {summary['ranges']['epochs']}, withheld: {summary['ranges']['withheld']}")
-    if "error" in summary:
-        errors = _table("error against truth", "rms", "50 %", "95 %", "largest")
+    for label, found in (("error against truth", summary), ("the same, smoothed", summary.get("smoothed", {}))):
+        if "error" not in found:
+            continue
+        errors = _table(label, "rms", "50 %", "95 %", "largest")
         units = {"horizontal": "m", "vertical": "m", "speed": "m/s", "heading_deg": "deg"}
         for name, unit in units.items():
-            error = summary["error"][name] or {}
+            error = found["error"][name] or {}
             values = [_rounded(error.get(key), ".3f") for key in ("rms", "p50", "p95", "max")]
             errors.add_row(f"{name.removesuffix('_deg')}, {unit}", *values)
         console.print(errors)
-        for name, nees in summary["nees"].items():
+        for name, nees in found["nees"].items():
             if nees:
                 console.print(f"NEES {name}: mean {nees['mean']:.2f} (ideal 3), in 95 %: {nees['in_95']:.1%}")
     if summary["outages"]:

@@ -28,6 +28,7 @@ from eskf_ros.replay.tum_writer import tum_text
 from eskf_ros.replay.views import Views, first_in_each
 
 NAMES = ("odometry.mcap", "trajectory.tum", "aids.csv", "details.npz", "summary.json")
+SMOOTHED_NAME = "trajectory_smoothed.tum"
 AIDS_HEADER = "stamp,arrival,aid,innovation_0,innovation_1,innovation_2,nis,dof,verdict,source\n"
 FIX_INTERVAL = 1_000_000_000
 """ns; time between two NavSatFix messages in odometry.mcap."""
@@ -44,17 +45,20 @@ _COVARIANCE_KNOWN = 3
 class ResultFiles:
     """Context manager: `write_summary` replaces the results of an earlier replay; without it no file is left.
 
-    Only files with a name in `NAMES` are ever replaced. With `output_rate` above 0 (Hz) the rows are thinned to it, as
+    Only files with a name in `NAMES` are ever replaced, and the smoothed trajectory: without ``smooths`` there is none
+    afterwards. With `output_rate` above 0 (Hz) the rows are thinned to it, as
     the navigator would: the first row at or after each multiple of the interval. Raises OSError or BagError if the
     folder cannot be written. `seconds` is the working time of the writing thread.
     """
 
-    def __init__(self, folder: Path, frames: Frames, output_rate: float = 0.0, has_truth: bool = False) -> None:
+    def __init__(
+        self, folder: Path, frames: Frames, output_rate: float = 0.0, has_truth: bool = False, smooths: bool = False
+    ) -> None:
         self.folder = folder
-        self._frames, self._has_truth = frames, has_truth
+        self._frames, self._has_truth, self._smooths = frames, has_truth, smooths
         self._strings = (frames.map, frames.base_link)
         self._interval = round(1e9 / output_rate) if output_rate else 0
-        self._last_stamp = self._last_fix = -1
+        self._last_stamp = self._last_fix = self._last_smoothed = -1
         self._writing: Future[None] | None = None
         self.seconds = 0.0
         self._all = ExitStack()
@@ -72,6 +76,9 @@ class ResultFiles:
             self._fixes = self._bag.add_topic("gps/filtered", FIX)
             self._views = Views(self._bag, self._frames, self._has_truth)
             self._trajectory = self._files.enter_context((self._partial / "trajectory.tum").open("wb"))
+            if self._smooths:
+                self._smoothed = self._bag.add_topic("odometry/smoothed", ODOMETRY)
+                self._smoothed_trajectory = self._files.enter_context((self._partial / SMOOTHED_NAME).open("wb"))
             self._aids = self._files.enter_context((self._partial / "aids.csv").open("w", encoding="ascii"))
             self._aids.write(AIDS_HEADER)
             self._writer = self._files.enter_context(ThreadPoolExecutor(1))
@@ -120,14 +127,31 @@ class ResultFiles:
         self._views.write(thinned, records)
         chosen = selected(thinned, thinned["position_known"])
         if datum is not None and len(chosen):
-            numbers = np.column_stack([chosen["position_map"], chosen["attitude_body_to_map"][:, [1, 2, 3, 0]]])
-            self._trajectory.write(tum_text(chosen["stamp"], numbers))
+            self._trajectory.write(tum_lines(chosen))
             self._bag.write(self._odometry, chosen["stamp"], odometry_messages(chosen), self._strings)
             chosen = chosen[first_in_each(chosen["stamp"], self._last_fix, FIX_INTERVAL)]
             self._bag.write(self._fixes, chosen["stamp"], fix_messages(chosen, MapFrame(datum)), self._strings)
             self._last_fix = int(chosen["stamp"][-1]) if len(chosen) else self._last_fix
         if len(rows):
             self._last_stamp = int(stamps[-1])
+        self.seconds += time.perf_counter() - began
+
+    @property
+    def scratch(self) -> Path:
+        """Folder for temporary files; it goes with this object."""
+        return self._partial
+
+    def write_smoothed(self, rows: NDArray[Any]) -> None:
+        """Append smoothed ODOMETRY rows (n,) to the smoothed trajectory and odometry."""
+        self._wait()
+        self._writing = self._writer.submit(self._write_smoothed, rows)
+
+    def _write_smoothed(self, rows: NDArray[Any]) -> None:
+        began = time.perf_counter()
+        chosen = selected(rows, _first_in_each(rows["stamp"], self._last_smoothed, self._interval))
+        self._last_smoothed = int(rows["stamp"][-1])
+        self._smoothed_trajectory.write(tum_lines(chosen))
+        self._bag.write(self._smoothed, chosen["stamp"], odometry_messages(chosen), self._strings)
         self.seconds += time.perf_counter() - began
 
     def _wait(self) -> None:
@@ -151,8 +175,10 @@ class ResultFiles:
         """Write summary.json, after `finish`, and rename all files; a NaN in it must have been replaced by None."""
         text = json.dumps(summary, indent=2, allow_nan=False) + "\n"
         (self._partial / "summary.json").write_text(text, encoding="utf-8")
-        for name in NAMES:
+        for name in (*NAMES, SMOOTHED_NAME) if self._smooths else NAMES:
             (self._partial / name).replace(self.folder / name)
+        if not self._smooths:
+            (self.folder / SMOOTHED_NAME).unlink(missing_ok=True)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -184,6 +210,13 @@ def aids_lines(records: NDArray[Any]) -> str:
     )
     line = "%d.%09d,%d.%09d,%s,%r,%r,%r,%r,%d,%s,%s\n"
     return "".join(map(line.__mod__, zip(*columns, strict=True)))
+
+
+def tum_lines(rows: NDArray[Any]) -> bytes:
+    """Return ODOMETRY rows (n,) as lines of a TUM trajectory."""
+    return tum_text(
+        rows["stamp"], np.column_stack([rows["position_map"], rows["attitude_body_to_map"][:, [1, 2, 3, 0]]])
+    )
 
 
 def odometry_messages(rows: NDArray[Any]) -> NDArray[Any]:

@@ -27,6 +27,7 @@ from eskf_ros.parameters.tree import Parameters
 from eskf_ros.replay.details import Details
 from eskf_ros.replay.feed import Feed
 from eskf_ros.replay.results import ResultFiles, selected
+from eskf_ros.replay.smoothing import Smoothing
 from eskf_ros.replay.summary import Summary, ranges_result, truth_result
 from eskf_ros.replay.topics import InputError, TopicNames, find_topics, truth_converter
 from eskf_ros.replay.truth import TruthComparison
@@ -41,6 +42,7 @@ class Options:
 
     ``mode``: loose, tight, ins-only, or empty for that of the parameters (tight with a file of `ranges`). ``ranges``,
     ``navigation``: RINEX files beside the recording; ``clock_offset``: s by which its stamps are ahead of UTC.
+    ``smooth``: go back over the recording afterwards.
     """
 
     folder: Path
@@ -48,6 +50,7 @@ class Options:
     outages: tuple[tuple[float, float], ...] = ()
     mode: str = ""
     order: str = "log"
+    smooth: bool = False
     output_rate: float = 50.0
     ranges: Path | None = None
     navigation: tuple[Path, ...] = ()
@@ -97,17 +100,20 @@ def replay(
         topics, hints = find_topics(reader, bag, parameters, options.truth, options.ranges is not None)
         to_epochs = truth_converter(topics, bag, parameters)
         thinned = bool(topics.truth) and 0.0 < options.output_rate < TRUTH_RATE
-        navigator = Navigator(parameters, output_rate=0.0 if thinned else options.output_rate)
+        output_rate = 0.0 if thinned else options.output_rate
+        navigator = Navigator(parameters, output_rate=output_rate, keeps_log=options.smooth)
         intake, messages = open_ranges(navigator, parameters, options, reader, topics)
         feed = Feed(navigator, topics, options.order, options.outages, options.mode == "ins-only", intake)
-        truth = TruthComparison(parameters.gnss.lever_arm if topics.truth_type == FIX else (0.0, 0.0, 0.0))
+        point = parameters.gnss.lever_arm if topics.truth_type == FIX else (0.0, 0.0, 0.0)
+        truth = TruthComparison(point)
         summary = Summary(feed, options.outages)
         details = Details(topics, parameters)
         if intake is not None:
             intake.watch = details.watch_signals
 
         thinning = options.output_rate if thinned else 0.0
-        with ResultFiles(options.folder, parameters.frames, thinning, bool(topics.truth)) as files:
+        with ResultFiles(options.folder, parameters.frames, thinning, bool(topics.truth), options.smooth) as files:
+            smoothing = Smoothing(navigator, files, point, bool(topics.truth)) if options.smooth else None
 
             def collect(rows: NDArray[Any], records: NDArray[Any], *beside: Any) -> None:
                 known, datum = selected(rows, rows["position_known"]), navigator.datum
@@ -116,6 +122,9 @@ def replay(
                 summary.add(known, records)
                 details.add_rows(rows)
                 clock.lap("compare")
+                if smoothing:
+                    smoothing.collect()
+                    clock.lap("smooth")
                 files.write(rows, records, datum, *beside)
                 clock.lap("wait")
 
@@ -129,10 +138,16 @@ def replay(
                 epochs = to_epochs(batch[topics.truth]) if topics.truth in batch else None
                 if epochs is not None:
                     truth.add_truth(epochs)
+                    if smoothing:
+                        smoothing.keep_truth(epochs)
                 collect(rows, navigator.take_records(), batch.get(topics.of(Stream.GNSS_POSITION)), epochs)
                 progress(reader.bytes_done / reader.bytes_total)
             clock.lap("read")
             collect(np.zeros(0, ODOMETRY), navigator.finish())
+            smoothed = {}
+            if smoothing:
+                smoothed = {"smoothed": smoothing.result(summary)}
+                clock.lap("smooth")
             files.finish()
             clock.lap("wait")
             compared = truth.compared() if topics.truth else None
@@ -147,6 +162,7 @@ def replay(
                 **({} if intake is None else ranges_result(navigator, intake, feed)),
                 **({} if compared is None else truth_result(topics.truth, truth.offered, compared)),
                 "outages": summary.outages(compared),
+                **smoothed,
                 "warnings": [
                     *reader.warnings,
                     *hints,

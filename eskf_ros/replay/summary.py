@@ -17,10 +17,14 @@ Stamps are integer ns, lengths m, times s; an unknown value is null.
   about the local vertical, yaw 0 = east; biases in IMU axes.
 - `error`: absolute errors at the truth epochs from the first known position on, heading from the first known heading
   on; of the antenna if the truth is a NavSatFix. `nees`: e' P^-1 e, 3 degrees of freedom, so its ideal mean is 3.
+- `smoothed` (with --smooth): the same `error`, `nees` and errors in `outages[]` of the smoothed trajectory; `nodes`:
+  stamps at which measurements changed the estimate; `breaks`: starts of the filter, over which nothing is smoothed;
+  `resets`: resets and takeovers, over which only position and velocity are carried back.
 - `ranges`: `epochs` read and epochs `withheld`, `signals` by `gnss.ranges.Status`, `clock_jumps_ms`: milliseconds by
   which the receiver clock jumped, `outvoted_states`: how often most satellites contradicted the state, whose variance
   was then inflated.
-- `outages[]`: `distance` is the length of the estimated path; the errors are those at the last truth epoch within.
+- `outages[]`: `distance` is the length of the estimated path; the errors are those at the last truth epoch within,
+  and `horizontal_max` the largest within.
 - `timing`: `write` is the work of a parallel thread, `wait` the part of it that was waited for.
 """
 
@@ -140,15 +144,22 @@ class Summary:
 
     def outages(self, compared: NDArray[Any] | None) -> list[dict[str, Any]]:
         """Return for each outage the length of the estimated path and, with truth, the errors at its last epoch."""
+        errors = [{}] * len(self._outages) if compared is None else self.outage_errors(compared)
+        return [
+            {"start": start, "length": length, "distance": distance, **error}
+            for (start, length), distance, error in zip(self._outages, self._distances, errors, strict=True)
+        ]
+
+    def outage_errors(self, compared: NDArray[Any]) -> list[dict[str, Any]]:
+        """Return for each outage the errors at the last truth epoch within, and the largest horizontal one."""
+        seconds = self._seconds(compared["stamp"])
         results = []
-        for (start, length), distance in zip(self._outages, self._distances, strict=True):
-            result: dict[str, Any] = {"start": start, "length": length, "distance": distance}
-            if compared is not None:
-                seconds = self._seconds(compared["stamp"])
-                inside = compared[(seconds >= start) & (seconds <= start + length)]
-                last = inside[-1] if len(inside) else None
-                result |= {name: None if last is None else _number(last[name]) for name in OUTAGE_ERRORS}
-                result["compared_stamp"] = None if last is None else int(last["stamp"])
+        for start, length in self._outages:
+            inside = compared[(seconds >= start) & (seconds <= start + length)]
+            last = inside[-1] if len(inside) else None
+            result: dict[str, Any] = {name: None if last is None else _number(last[name]) for name in OUTAGE_ERRORS}
+            result["horizontal_max"] = None if last is None else float(inside["horizontal"].max())
+            result["compared_stamp"] = None if last is None else int(last["stamp"])
             results.append(result)
         return results
 
@@ -185,7 +196,6 @@ class Summary:
 
 def truth_result(topic: str, offered: int, compared: NDArray[Any]) -> dict[str, Any]:
     """Return `truth`, `error` and `nees` of COMPARED rows (n,) out of `offered` truth epochs."""
-    nees = {"position": compared["nees_position"], "attitude": compared["nees_attitude"]}
     return {
         "truth": {
             "topic": topic,
@@ -193,6 +203,14 @@ def truth_result(topic: str, offered: int, compared: NDArray[Any]) -> dict[str, 
             "compared": len(compared),
             "heading_compared": int(np.isfinite(compared["heading_deg"]).sum()),
         },
+        **accuracy(compared),
+    }
+
+
+def accuracy(compared: NDArray[Any]) -> dict[str, Any]:
+    """Return `error` and `nees` of COMPARED rows (n,)."""
+    nees = {"position": compared["nees_position"], "attitude": compared["nees_attitude"]}
+    return {
         "error": {name: _error(compared[name]) for name in ("horizontal", "vertical", "speed", "heading_deg")},
         "nees": {name: _consistency(values) for name, values in nees.items()},
     }

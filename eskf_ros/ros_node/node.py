@@ -45,6 +45,7 @@ from eskf_ros.ros_node.publishers import OUTPUT_QOS, OVERRIDING, Outputs
 from eskf_ros.ros_node.set_pose import set_pose
 from eskf_ros.ros_node.subscriptions import AidInput, open_inputs
 from eskf_ros.ros_node.warm_up import compile_node
+from eskf_ros.smooth.fixed_lag import FixedLag
 
 INPUT_DEPTH = 1000
 """IMU messages that may wait while the computer is busy elsewhere: a second of a fast IMU."""
@@ -69,7 +70,9 @@ class EskfNode(Node):
         """
         super().__init__("eskf_node", context=context)
         self.parameters = declare(self, profile=profile)
-        self.navigator = Navigator(self.parameters)
+        lag = self.parameters.smoother.lag
+        self.navigator = Navigator(self.parameters, keeps_log=lag > 0.0)
+        self.fixed_lag = FixedLag(self.navigator, lag) if lag > 0.0 else None
         self.trouble = Trouble(self.get_logger().error)
         self.verdicts: dict[tuple[int, Verdict], int] = {}
         self.resets = 0
@@ -218,6 +221,8 @@ class EskfNode(Node):
     def _reset(self, why: str) -> None:
         self.get_logger().warn(f"{why}: the estimator starts again")
         self.navigator.reset()
+        if self.fixed_lag is not None:
+            self.fixed_lag.forget()
         self.resets += 1
         self._first_stamp = 0
         for source in self.aid_inputs:
@@ -351,6 +356,8 @@ class EskfNode(Node):
             self.get_logger().warn("the alignment began again: the IMU was silent, or fix after fix was rejected")
         self._restarts = self.navigator.restarts
         self._publish_quality()
+        if self.fixed_lag is not None:
+            self.outputs.publish_smoothed(self.fixed_lag.update())
         self._diagnostics.publish(status_report(self._snapshot(), stamp))
         if self.range_intake is not None:
             self.range_intake.wants_solution = self._solutions.get_subscription_count() > 0

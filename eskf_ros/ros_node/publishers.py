@@ -49,7 +49,12 @@ class Outputs:
             Odometry, "odometry/global", ODOMETRY_QOS, qos_overriding_options=OVERRIDING
         )
         self._local = node.create_publisher(Odometry, "odometry/local", ODOMETRY_QOS, qos_overriding_options=OVERRIDING)
-        self.publishers = (self._global, self._local)
+        self.publishers: tuple[Any, ...] = (self._global, self._local)
+        if parameters.smoother.lag > 0.0:
+            self._smoothed = node.create_publisher(
+                Odometry, "odometry/smoothed", ODOMETRY_QOS, qos_overriding_options=OVERRIDING
+            )
+            self.publishers = (*self.publishers, self._smoothed)
         self.transforms = self._open_transforms(parameters)
 
     def publish(self, rows: np.ndarray, index: int) -> None:
@@ -70,6 +75,14 @@ class Outputs:
         if self.transforms is not None:
             self.transforms.send(row)
         self.published += 1
+
+    def publish_smoothed(self, rows: np.ndarray) -> None:
+        """Publish smoothed ODOMETRY rows (n,); they may be changed."""
+        for index in range(len(rows)):
+            if self._two_d:
+                flatten(rows[index])
+            if fill_odometry(rows, index, self._two_d, self._numbers):
+                self._smoothed.publish(self._global_writer.write(int(rows[index]["stamp"]), self._numbers[GLOBAL]))
 
     def _writer(self, frame: str, child_frame: str) -> AnyOdometryWriter:
         try:

@@ -56,6 +56,12 @@ def trajectory_table(rows: NDArray[Any], datum: tuple[float, float, float] | Non
     )
 
 
+def bias_table(rows: NDArray[Any]) -> Any:
+    """Return the biases of ODOMETRY rows (n,) as a table; columns as in `eskf_ros.Result`."""
+    names = ("stamp", "accel_bias", "gyro_bias", "accel_bias_std", "gyro_bias_std")
+    return as_table({name: rows[name] for name in names})
+
+
 def innovation_table(records: NDArray[Any]) -> Any:
     """Return the innovations of RECORD rows (n,) as a table; columns as in `eskf_ros.Result`."""
     return as_table(

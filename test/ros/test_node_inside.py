@@ -657,3 +657,30 @@ def test_the_orientation_of_the_imu_tells_the_heading_if_asked_to(make, start, u
         std = math.sqrt(row["pose_covariance"][5, 5])
         assert std < math.radians(15.0)
         assert abs(math.remainder(found - told, math.tau)) < 3.0 * std
+
+
+@needs_ros
+def test_smoothed_odometry_comes_late_and_surer(make):
+    """With a lag, each position comes again: in order, at 50 Hz, not later than lag and window say, and surer."""
+    inside = make("-p", "smoother.lag:=3.0")
+    drive = read_drive(50.0)
+    begin = drive[0][0]
+    for second in range(51):
+        inside.play([m for m in drive if begin + second * SECOND <= m[0] < begin + (second + 1) * SECOND])
+        inside.report()
+    name = next(topic for topic in inside.published if topic.endswith("odometry/smoothed"))
+    strings = StringTable()
+    kind = "nav_msgs/msg/Odometry"
+    live, smoothed = (
+        np.concatenate(
+            [decode(kind, np.frombuffer(data, np.uint8)[None], strings)[0] for data in inside.published[topic]]
+        )
+        for topic in (name.replace("smoothed", "global"), name)
+    )
+    assert set(np.diff(smoothed["stamp"][1:]).tolist()) == {20_000_000}
+    assert 4 * SECOND < live["stamp"][-1] - smoothed["stamp"][-1] < 7 * SECOND
+    _, first, second = np.intersect1d(live["stamp"], smoothed["stamp"], return_indices=True)
+    variance = [rows["pose_covariance"].reshape(-1, 36)[i, 0] for rows, i in ((live, first), (smoothed, second))]
+    # The car stands for 20 s; then it needs some to find its heading.
+    assert np.median((variance[1] / variance[0])[-500:]) < 0.8
+    assert make().node.fixed_lag is None

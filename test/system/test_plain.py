@@ -14,6 +14,7 @@ from eskf_ros.compiled import COMPILED
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.scenario import simulate
+from eskf_ros.smooth.smoother import Smoother
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 
@@ -23,7 +24,8 @@ def drive(path: Path) -> None:
     recording = simulate("tunnel_drive", seed=3, start=17.0, stop=25.0, imu_rate=100.0, grade="industrial")
     # Without a datum: the first fix is it.
     parameters = {**recording.parameters(), "alignment.static_duration": 1.0, "datum": []}
-    navigator = Navigator(from_mapping(parameters))
+    navigator = Navigator(from_mapping(parameters), keeps_log=True)
+    smoother = Smoother(navigator)
     rows = []
     fix = velocity = 0
     for k, arrival in enumerate(recording.imu_arrival):
@@ -53,7 +55,10 @@ def drive(path: Path) -> None:
                 recording.imu_stamp[sample], recording.specific_force[sample], recording.angular_rate[sample]
             )
         )
-    np.savez(path, compiled=COMPILED, rows=np.concatenate(rows), records=navigator.finish())
+    records = navigator.finish()
+    smoother.smooth()
+    smoothed = np.concatenate([np.asarray(part) for part in smoother.rows()])
+    np.savez(path, compiled=COMPILED, rows=np.concatenate(rows), records=records, smoothed=smoothed)
 
 
 @pytest.mark.slow
@@ -75,6 +80,11 @@ def test_plain_kernels_agree_with_the_compiled_ones(tmp_path: Path) -> None:
                 continue
             scale = np.abs(ours[name]).max(axis=0) + 1e-6
             np.testing.assert_allclose(ours[name] / scale, theirs[name] / scale, rtol=0.0, atol=1e-8, err_msg=name)
+        ours, theirs = compiled["smoothed"], plain["smoothed"]
+        assert len(ours) > 500
+        for name in ("position_map", "velocity_map", "attitude_body_to_map", "accel_bias", "gyro_bias"):
+            np.testing.assert_allclose(ours[name], theirs[name], rtol=0.0, atol=1e-7, err_msg=name)
+        np.testing.assert_allclose(ours["pose_covariance"], theirs["pose_covariance"], rtol=1e-6, atol=1e-9)
         assert len(compiled["records"]) > 60
         for name in ("stamp", "arrival", "stream", "verdict", "dof"):
             np.testing.assert_array_equal(compiled["records"][name], plain["records"][name])

@@ -34,7 +34,7 @@ FLOORS = (
     ("filter.loop",),
     ("filter.readout",),
     ("filter.navigator",),
-    ("filter.warm_up", "inputs"),
+    ("filter.warm_up", "inputs", "smooth"),
     ("report",),
     ("replay", "simulate", "migrate"),
     ("tables", "doctor", "watch"),

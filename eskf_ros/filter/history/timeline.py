@@ -392,6 +392,10 @@ def raise_barrier(states, blank, timeline):
         return
     states[FILTER].imu_next = 0
     states[FILTER].aid_next = 0
+    # What follows is another trajectory: the pose or the datum was set.
+    states[FILTER].forward.node_next = 0
+    states[FILTER].forward.point_next = 0
+    states[FILTER].forward.breaks = NEVER
     for lane in range(LANES):
         blank[lane] = states[lane]
     t.imu_count = 0

@@ -207,15 +207,20 @@ def propagate_axis_noise(covariance, rotation, density, dt):
                 covariance[6 + i, 6 + j] += attitude * dt
 
 
+@njit
+def vertical(gravity):
+    """Return the unit vector against gravity (m/s2, map) and gravity over Earth radius (1/s2)."""
+    strength = math.sqrt(gravity[0] * gravity[0] + gravity[1] * gravity[1] + gravity[2] * gravity[2])
+    return (-gravity[0] / strength, -gravity[1] / strength, -gravity[2] / strength), strength / SEMI_MAJOR_AXIS
+
+
 @njit_in_caller
 def propagate_covariance(covariance, size, rotation, force, gravity, earth_rate, dt, coupling, work):
     """Apply one interval's transition matrix on both sides of the covariance; arguments as for `apply_transition`.
 
     ``size`` errors are in use; ``gravity`` is the vector (m/s2, map); the result is exactly symmetric.
     """
-    strength = math.sqrt(gravity[0] * gravity[0] + gravity[1] * gravity[1] + gravity[2] * gravity[2])
-    up = (-gravity[0] / strength, -gravity[1] / strength, -gravity[2] / strength)
-    gradient = strength / SEMI_MAJOR_AXIS
+    up, gradient = vertical(gravity)
     half = work.half
     count = min(-(-size // ABREAST) * ABREAST, len(covariance))
     apply_transition(covariance, half, count, rotation, force, up, gradient, earth_rate, dt, coupling)
@@ -232,12 +237,18 @@ def propagate_covariance(covariance, size, rotation, force, gravity, earth_rate,
 
 
 @njit
+def turn_rows(columns, block, matrix):
+    """Replace the three rows from index ``block`` by ``matrix`` (3x3 row tuples) times them."""
+    for j in range(columns.shape[1]):
+        turned = rotate(matrix, (columns[block, j], columns[block + 1, j], columns[block + 2, j]))
+        for i in range(3):
+            columns[block + i, j] = turned[i]
+
+
+@njit
 def update_error_axes(covariance, block, matrix):
     """Transform the three errors from index ``block``, and their covariance, by ``matrix`` (3x3 row tuples)."""
-    for j in range(len(covariance)):
-        error = rotate(matrix, (covariance[block, j], covariance[block + 1, j], covariance[block + 2, j]))
-        for i in range(3):
-            covariance[block + i, j] = error[i]
+    turn_rows(covariance, block, matrix)
     for j in range(len(covariance)):
         error = rotate(matrix, (covariance[j, block], covariance[j, block + 1], covariance[j, block + 2]))
         for i in range(3):

@@ -134,6 +134,8 @@ def inflate_lasting_error(state, before, now, factor, settings, work):
     if before == 0.0:
         reset_augmented(state, place, 3, settings)
     for i in range(place, place + 3):
+        # Another scale: for a smoother it is another error.
+        state.forward.renewed |= 1 << (i - ERROR_SIZE)
         state.optional[i - ERROR_SIZE] *= ratio
         for j in range(state.error_size):
             state.covariance[i, j] *= ratio

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.inertial.covariance import update_error_axes
+from eskf_ros.filter.inertial.covariance import turn_rows, update_error_axes
 from eskf_ros.filter.inertial.navigation_frame import local_up
 from eskf_ros.filter.state.enums import Verdict
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, VELOCITY
@@ -122,6 +122,7 @@ def reset_attitude_error(state, correction):
     angle = dot(up, (correction[ATTITUDE], correction[ATTITUDE + 1], correction[ATTITUDE + 2]))
     turn = to_matrix(from_rotation_vector((angle * up[0], angle * up[1], angle * up[2])))
     update_error_axes(state.covariance, ATTITUDE, turn)
+    turn_rows(state.forward.reset, 0, turn)
 
 
 @njit

@@ -174,6 +174,7 @@ def propagate_mag_error(state, heading, settings):
         return
     fading = math.exp(-way)
     state.optional[i - ERROR_SIZE] *= fading
+    state.forward.fade[i - ERROR_SIZE] *= fading
     covariance = state.covariance
     for j in range(state.error_size):
         covariance[i, j] *= fading

@@ -32,6 +32,7 @@ def reset_augmented(state, place, count, settings):
     covariance = state.covariance
     for i in range(place, place + count):
         state.optional[i - ERROR_SIZE] = 0.0
+        state.forward.renewed |= 1 << (i - ERROR_SIZE)
         for j in range(len(covariance)):
             covariance[i, j] = 0.0
             covariance[j, i] = 0.0

@@ -70,6 +70,7 @@ def reset_or_jump_clock(state, aids, first, end, which, settings, work):
             agreeing += 1
     if 2 * agreeing > work.signal_count:
         state.optional[place - ERROR_SIZE] += jump * MILLISECOND
+        state.forward.renewed |= 1 << (place - ERROR_SIZE)
         state.tight.clock_jumps += abs(jump)
         gather(state, aids, first, end, settings, work)
 

@@ -1,0 +1,1 @@
+"""The smoother: the best trajectory afterwards, from measurements before and after each moment."""
