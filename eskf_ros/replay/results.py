@@ -148,7 +148,7 @@ class ResultFiles:
 
     def _write_smoothed(self, rows: NDArray[Any]) -> None:
         began = time.perf_counter()
-        chosen = selected(rows, _first_in_each(rows["stamp"], self._last_smoothed, self._interval))
+        chosen = selected(rows, first_in_each(rows["stamp"], self._last_smoothed, self._interval))
         self._last_smoothed = int(rows["stamp"][-1])
         self._smoothed_trajectory.write(tum_lines(chosen))
         self._bag.write(self._smoothed, chosen["stamp"], odometry_messages(chosen), self._strings)

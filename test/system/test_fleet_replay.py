@@ -21,7 +21,7 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 BAG = CHECKOUT / "bags" / "tunnel_drive.mcap"
 CONFIG = CHECKOUT / "config" / "tunnel_drive.yaml"
 OPTIONS = ["--config", str(CONFIG), "--truth", "truth", "--quiet"]
-FILES = ["aids.csv", "odometry.mcap", "summary.json", "trajectory.tum"]
+FILES = ["aids.csv", "details.npz", "odometry.mcap", "summary.json", "trajectory.tum"]
 
 
 def make_fleet(folder: Path, count: int) -> Path:
