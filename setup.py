@@ -103,6 +103,8 @@ setup(
             "ruff",
             "sidereon; sys_platform == 'linux' and platform_machine == 'x86_64'",
         ],
+        # The documents as a site (.ci/docs); docs/developing.md says why Sphinx.
+        "docs": ["furo", "myst-parser>=4", "sphinx>=8", "sphinxcontrib-mermaid"],
         # Beside [test]: the benchmarks that draw figures.
         "benchmark": ["matplotlib"],
     },
