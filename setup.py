@@ -87,7 +87,7 @@ setup(
             "bokeh>=3.4",
             "gtsam",
             "hypothesis",
-            "matplotlib",  # examples/compare_configurations.py draws a plot
+            "matplotlib",  # examples/compare_configurations.py and examples/lessons draw
             "mypy",
             "pygeomag",
             "pymap3d",
@@ -97,6 +97,8 @@ setup(
             "ruff",
             "sidereon; sys_platform == 'linux' and platform_machine == 'x86_64'",
         ],
+        # The pictures of examples/lessons: small PNG files that a page of Markdown shows, which Bokeh does not make.
+        "lessons": ["matplotlib"],
         # Beside [test]: the benchmarks that draw figures.
         "benchmark": ["matplotlib"],
     },
