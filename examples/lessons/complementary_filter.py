@@ -127,8 +127,8 @@ def run(runs: int) -> Outcome:
 LESSON = Lesson(
     name="complementary_filter",
     title="Complementary filter against ESKF",
-    sentence="The best of seven time constants has {rms} deg rms of tilt after calibration ({rms_raw} without), the ESKF "
-    "{rms_eskf} deg.",
+    sentence="The best of seven time constants has {rms} deg rms of tilt after calibration ({rms_raw} without), the "
+    "ESKF {rms_eskf} deg.",
     text=TEXT,
     by_hand="""
 ```sh

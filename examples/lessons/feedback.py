@@ -26,7 +26,7 @@ TEXT = """
 
 A plane world: a car, two accelerometers, one gyro, fixes of 1 m at 5 Hz. The error-state filter has eight states:
 position, velocity, heading, gyro bias, two accelerometer biases
-([the file](../../examples/lessons/feedback.py), numpy only). It is built in two ways that share every line but one:
+([the file](../../examples/lessons/feedback.py), numpy only). It is built in two ways that share every line but two:
 
 - **feed-forward** (open loop): the INS runs on its own for ever. The filter estimates its error, and the user gets the
   difference.
@@ -138,7 +138,7 @@ def run(runs: int) -> Outcome:
                 style = "-" if case > 1 else ":"
                 text = f"{label}, {math.degrees(bias):.2g} deg/s"
                 left.semilogy(times[::10], errors[::10], style, color=colour, linewidth=0.8, label=text)
-    left.set(xlabel="time, s", ylabel="horizontal error, m", ylim=(0.01, 1e5))
+    left.set(xlabel="time, s", ylabel="horizontal error, m", ylim=(0.01, 1e4))
     left.legend(fontsize=7, loc="upper left")
     degrees = np.degrees(GYRO_BIASES)
     right.loglog(degrees, rms["forward"], "o-", color=RED, label="feed-forward")

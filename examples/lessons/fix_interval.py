@@ -60,8 +60,8 @@ def run(runs: int) -> Outcome:
         if interval >= 10.0:
             right.plot(track.seconds[shown], sigma[shown], color=colour, linewidth=1.5, label=f"sigma, {interval:g} s")
             right.plot(track.seconds[shown], track.horizontal[shown], color=colour, linewidth=0.7, label="error")
-    left.set(xlabel="time, s", ylabel="published sigma, m")
-    left.legend(fontsize=8, title="a fix every", title_fontsize=8)
+    left.set(xlabel="time, s", ylabel="published sigma, m", ylim=(0.08, 20.0))
+    left.legend(fontsize=8, title="a fix every", title_fontsize=8, loc="lower right", ncols=4)
     right.set(xlabel="time, s", ylabel="m")
     right.legend(fontsize=8)
     figures["tooth"] = number(highs[-1] / lows[-1])

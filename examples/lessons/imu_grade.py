@@ -103,5 +103,5 @@ LESSON = Lesson(
 `car.yaml` has the parameters that `eskf_simulate` prints, and `zupt.enabled: false`.
 """,
     run=run,
-    runs=10,
+    runs=5,
 )

@@ -129,5 +129,5 @@ LESSON = Lesson(
 `noise_density` and the two `random_walk` of `imu` are a tenth of it. Compare the NEES in the tables.
 """,
     run=run,
-    runs=30,
+    runs=20,
 )
