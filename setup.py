@@ -93,7 +93,7 @@ setup(
             "distributed",
             "gtsam",
             "hypothesis",
-            "matplotlib",  # examples/compare_configurations.py draws a plot
+            "matplotlib",  # examples/compare_configurations.py and examples/lessons draw
             "mypy",
             "pygeomag",
             "pymap3d",
@@ -105,6 +105,8 @@ setup(
         ],
         # The documents as a site (.ci/docs); docs/developing.md says why Sphinx.
         "docs": ["furo", "myst-parser>=4", "sphinx>=8", "sphinxcontrib-mermaid"],
+        # The pictures of examples/lessons: small PNG files that a page of Markdown shows, which Bokeh does not make.
+        "lessons": ["matplotlib"],
         # Beside [test]: the benchmarks that draw figures.
         "benchmark": ["matplotlib"],
     },
