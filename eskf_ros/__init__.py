@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Filter", "Result", "__version__", "check", "load_parameters", "read_bag", "run"]
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 _HOMES = {
     "Filter": "eskf_ros.api.Filter",
