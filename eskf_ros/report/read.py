@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 SUMMARY, ODOMETRY, AIDS, DETAILS = "summary.json", "odometry.mcap", "aids.csv", "details.npz"
 TRAJECTORY = "trajectory.tum"
 SMOOTHED = "trajectory_smoothed.tum"
-ODOMETRY_TOPIC = {"odometry/global": "nav_msgs/msg/Odometry"}
+ODOMETRY_TOPIC = "/odometry/global"
 BLOCK = 1 << 23
 """Bytes of aids.csv that are parsed at once."""
 
@@ -126,8 +126,8 @@ def _odometry(path: Path) -> dict[str, Any]:
         return _columns(None)
     parts: dict[str, list[Array]] = {}
     with open_bag([path]) as reader:
-        for batch in reader.batches(ODOMETRY_TOPIC):
-            for name, values in _columns(batch["odometry/global"].messages).items():
+        for batch in reader.batches({ODOMETRY_TOPIC: "nav_msgs/msg/Odometry"}):
+            for name, values in _columns(batch[ODOMETRY_TOPIC].messages).items():
                 parts.setdefault(name, []).append(values)
     if not parts:
         return _columns(None)
