@@ -107,6 +107,7 @@ setup(
             "pyrtklib5; sys_platform == 'linux' and platform_machine == 'x86_64' and python_version < '3.13'",
             "pytest",
             "ruff",
+            "setuptools>=70.1",  # makes wheels without the package wheel
             "sidereon; sys_platform == 'linux' and platform_machine == 'x86_64'",
         ],
         # Beside [test]: the benchmarks that draw figures.
