@@ -41,12 +41,24 @@ class BuildWithMachineCode(build_py):
 
 setup(
     name=package_name,
-    version="0.1.0",
+    version="1.0.0",
     description="Error-state Kalman filter fusing an IMU with GNSS: ROS 2 navigation and replay of recordings",
+    long_description=Path("README.md").read_text(encoding="utf-8"),
+    long_description_content_type="text/markdown",
+    url="https://github.com/eskf-ros/eskf_ros",
+    project_urls={"Bug tracker": "https://github.com/eskf-ros/eskf_ros/issues"},
     author="eskf_ros maintainers",
+    author_email="eskf-ros@users.noreply.github.com",
     maintainer="eskf_ros maintainers",
-    maintainer_email="maintainers@example.org",
+    maintainer_email="eskf-ros@users.noreply.github.com",
     license="Apache-2.0",
+    classifiers=[
+        "Development Status :: 5 - Production/Stable",
+        "Intended Audience :: Science/Research",
+        "Operating System :: POSIX :: Linux",
+        "Programming Language :: Python :: 3",
+        "Topic :: Scientific/Engineering",
+    ],
     cmdclass={"build_py": BuildWithMachineCode},
     packages=find_packages(include=[package_name, f"{package_name}.*"]),
     data_files=[
@@ -101,6 +113,7 @@ setup(
             "pyrtklib5; sys_platform == 'linux' and platform_machine == 'x86_64' and python_version < '3.13'",
             "pytest",
             "ruff",
+            "setuptools>=70.1",  # makes wheels without the package wheel
             "sidereon; sys_platform == 'linux' and platform_machine == 'x86_64'",
         ],
         # The documents as a site (.ci/docs); docs/developing.md says why Sphinx.

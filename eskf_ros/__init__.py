@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Filter", "Result", "Smoothed", "__version__", "calibrate", "check", "load_parameters", "read_bag", "run"]
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 _HOMES = {
     "Filter": "eskf_ros.api.Filter",

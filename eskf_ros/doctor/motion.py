@@ -53,8 +53,10 @@ DEGREES = math.degrees(1.0)
 
 @dataclass(frozen=True)
 class Course:
-    """Means over a second by the receiver: ``time`` (n,) s, ``speed`` m/s, ``turn`` rad/s counter-clockwise, and
-    ``along``, ``left``: acceleration (m/s2) along the course and to its left.
+    """Means over a second by the receiver.
+
+    ``time`` (n,) s, ``speed`` m/s, ``turn`` rad/s counter-clockwise, and ``along``, ``left``: acceleration (m/s2) along
+    the course and to its left.
     """
 
     time: Array

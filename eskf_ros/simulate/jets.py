@@ -1,7 +1,7 @@
-"""Functions of time with their derivatives: arithmetic on Taylor polynomials (Griewank and Walther, Evaluating
-Derivatives, 2nd ed., chapter 13).
+"""Functions of time with their derivatives: arithmetic on Taylor polynomials.
 
-A motion written as a formula of such functions has exact velocities, accelerations and angular rates.
+Griewank and Walther, Evaluating Derivatives, 2nd ed., chapter 13. A motion written as a formula of such functions
+has exact velocities, accelerations and angular rates.
 """
 
 from __future__ import annotations

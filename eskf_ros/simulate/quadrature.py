@@ -17,8 +17,11 @@ class PositionIntegral:
     """The way from the start by Gauss quadrature between knots, exact to rounding for the motion of a vehicle."""
 
     def __init__(self, velocity: Callable[[Array], Sequence[Array]], breakpoints: Array) -> None:
-        """``velocity`` gives its three components, each (n, m), at times (n, m) in s; it is smooth between those of
-        ``breakpoints``, which begin at 0."""
+        """Integrate ``velocity`` from time 0 on.
+
+        It gives its three components, each (n, m), at times (n, m) in s, and is smooth between those of
+        ``breakpoints``, which begin at 0.
+        """
         self._velocity = velocity
         counts = np.ceil(np.diff(breakpoints) / _KNOT_INTERVAL).astype(int)
         starts = [

@@ -13,6 +13,7 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
+import yaml
 
 import eskf_ros
 
@@ -35,6 +36,9 @@ ROS_PACKAGES = {
 }
 # Imported by the tests alone.
 ROS_TEST_PACKAGES = {"rosgraph_msgs", "std_msgs"}
+# Programs of ROS that tests call.
+ROS_TEST_TOOLS = {"ament_flake8", "ament_pep257", "ament_xmllint"}
+ADDRESS = "https://github.com/eskf-ros/eskf_ros"
 # Used where somebody else has installed it.
 OPTIONAL = {"bokeh", "distributed", "pandas", "robot_localization", "pygeomag"}
 # What `eskf_calibrate --static` imports when it is asked for: the extra [calibrate].
@@ -116,6 +120,41 @@ def test_one_version_everywhere() -> None:
     newest = re.search(r"^(\d+\.\d+\.\d+) \(\d{4}-\d\d-\d\d\)$", changelog, re.MULTILINE)
     assert newest is not None
     assert newest.group(1) == eskf_ros.__version__
+    citation = yaml.safe_load((CHECKOUT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["version"] == eskf_ros.__version__
+    assert f"{citation['version']} ({citation['date-released']})" in changelog
+
+
+def test_one_address_everywhere() -> None:
+    """Where to find the project and whom to write to: the same in all files, and nobody's example."""
+    urls = {element.get("type"): element.text for element in PACKAGE_XML.findall("url")}
+    assert urls == {"website": ADDRESS, "repository": ADDRESS, "bugtracker": f"{ADDRESS}/issues"}
+    assert SETUP["url"] == ADDRESS
+    people = [*PACKAGE_XML.findall("maintainer"), *PACKAGE_XML.findall("author")]
+    assert {element.get("email") for element in people} == {SETUP["maintainer_email"]} == {SETUP["author_email"]}
+    assert len(people) == 2
+    assert yaml.safe_load((CHECKOUT / "CITATION.cff").read_text(encoding="utf-8"))["repository-code"] == ADDRESS
+    for path in ("package.xml", "setup.py", "CITATION.cff", "README.md", "CONTRIBUTING.md"):
+        assert "example.org" not in (CHECKOUT / path).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("form", sorted((CHECKOUT / ".github" / "ISSUE_TEMPLATE").glob("*.yml")), ids=lambda f: f.stem)
+def test_forms_for_issues_ask_for_what_an_answer_needs(form: Path) -> None:
+    text = form.read_text(encoding="utf-8")
+    fields = yaml.safe_load(text).get("body", [])
+    needed = {field["id"] for field in fields if field.get("validations", {}).get("required")}
+    if form.stem == "estimate":
+        assert needed >= {"check", "summary", "parameters"}
+    for command in re.findall(r"`(eskf_\w+) ", text):
+        assert any(line.startswith(f"{command} = ") for line in entry_points()), f"{form.name} names {command}"
+
+
+def test_ci_runs_the_scripts_that_are_here() -> None:
+    workflow = yaml.safe_load((CHECKOUT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8"))
+    runs = [step["run"] for job in workflow["jobs"].values() for step in job["steps"] if "run" in step]
+    assert ".ci/run" in runs
+    for path in {path for run in runs for path in re.findall(r"\.ci/\w+", run)}:
+        assert (CHECKOUT / path).is_file(), f"ci.yml runs {path}"
 
 
 def test_installed_version() -> None:
@@ -152,7 +191,7 @@ def test_every_import_of_the_tests_is_declared() -> None:
     extras: dict[str, list[str]] = SETUP["extras_require"]  # type: ignore[assignment]
     required = distributions([*SETUP["install_requires"], *extras["test"]])  # type: ignore[misc]
     imported = third_party_imports_of_tests()
-    assert dependencies("exec_depend", "test_depend") >= ROS_PACKAGES | ROS_TEST_PACKAGES
+    assert dependencies("exec_depend", "test_depend") >= ROS_PACKAGES | ROS_TEST_PACKAGES | ROS_TEST_TOOLS
     for name in imported - ROS_PACKAGES - ROS_TEST_PACKAGES:
         assert DISTRIBUTIONS.get(name, name) in required, f"the tests import {name}; setup.py does not require it"
 
@@ -197,7 +236,7 @@ def test_files_the_commands_of_run_need() -> None:
         assert (CHECKOUT / path).is_file(), f"run names {path}"
 
 
-@pytest.mark.parametrize("path", ["run", ".ci/run", ".ci/colcon"])
+@pytest.mark.parametrize("path", ["run", ".ci/run", ".ci/colcon", ".ci/jazzy", ".ci/release"])
 def test_scripts_are_executable(path: str) -> None:
     assert (CHECKOUT / path).stat().st_mode & 0o111
     subprocess.run(["bash", "-n", CHECKOUT / path], check=True)
