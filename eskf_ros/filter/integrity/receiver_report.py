@@ -18,8 +18,8 @@ from eskf_ros.filter.integrity.receiver_monitor import (
 from eskf_ros.filter.integrity.scatter import NOTABLE_CALM
 from eskf_ros.filter.state.error_state import SOURCES
 
-FEW_TAKEOVERS = 2
-"""Takeovers by the humble lane from which on they are reported."""
+SCATTERED_VELOCITY = 3.0
+"""Mean square of the velocities about the humble lane, over their variance, from which on they claim too much."""
 
 DOUBTFUL_SIGMAS = 15.0
 """Standard deviations beyond which a fault of the installation is reported although IMU or fixes are at fault, too."""
@@ -44,17 +44,16 @@ def aid_complaints(state: np.void, settings: np.void, is_explained: bool, is_imu
     for source in range(SOURCES):
         if is_explained or state["receiver"]["fix_count"][source] < MANY_FIXES:
             continue
-        paths = _path_complaints(state, source)
-        faults = _fault_complaints(state, settings, source, is_imu_doubtful or bool(paths))
         lies = _covariance_complaints(state, source, float(settings["gnss_covariance_scale"]))
+        # Fixes that scatter seem to jump.
+        paths = [] if lies else _path_complaints(state, source)
+        faults = _fault_complaints(state, settings, source, is_imu_doubtful or bool(paths))
         # Those faults explain drifts, contradictions and a high NIS: no sentences of their own.
         found += paths + faults + lies
         # One that is not certain for long may do so, too; or axes of the IMU, which take their time.
         is_open = bool(state["installation"]["found"][source].any())
         if is_certain and not is_open and not paths and not faults and not lies:
             found += _velocity_complaints(state, source) + _departure_complaints(state, source)
-    if is_certain and not found and not state["installation"]["found"].any():
-        found += _takeover_complaints(state)
     if state["recovery"]["resets"]:
         cause = "" if found or not is_certain else f": multipath for many seconds; or {NOISY_IMU}"
         found.append(
@@ -66,16 +65,6 @@ def aid_complaints(state: np.void, settings: np.void, is_explained: bool, is_imu
 
 def _of(source: int) -> str:
     return "" if source == 0 else " of the second receiver"
-
-
-def _takeover_complaints(state: np.void) -> list[str]:
-    """Return a sentence if the humble lane took over again and again, and no receiver is at fault."""
-    takeovers = int(state["trust"]["takeovers"])
-    if takeovers < FEW_TAKEOVERS:
-        return []
-    return [
-        f"{takeovers} times the receivers contradicted the IMU, and a lane that believes it less took over: {NOISY_IMU}"
-    ]
 
 
 def _fault_complaints(state: np.void, settings: np.void, source: int, is_doubtful: bool) -> list[str]:
@@ -148,6 +137,12 @@ def aid_notes(state: np.void) -> list[str]:
 
 def _velocity_complaints(state: np.void, source: int) -> list[str]:
     mean, count = (float(value) for value in state["receiver"]["velocity_nis"][source])
+    scatter = float(state["scatter"]["velocity"][source])
+    if count >= 2 * MANY_FIXES and scatter > SCATTERED_VELOCITY:
+        return [
+            f"the velocities{_of(source)} scatter {math.sqrt(scatter):.1f} times as much as they claim, and are used "
+            "so; set gnss.velocity_std_floor"
+        ]
     if count < 2 * MANY_FIXES or mean < HIGH_NIS:
         return []
     return [
@@ -167,13 +162,16 @@ def _path_complaints(state: np.void, source: int) -> list[str]:
 
 
 def _departure_complaints(state: np.void, source: int) -> list[str]:
-    departures = int(state["receiver"]["departures"][source])
-    if departures < FEW_DEPARTURES:
+    """Return a sentence if a receiver drifted off the path of the IMU, or the humble lane had to take over."""
+    departures, stamp = int(state["receiver"]["departures"][source]), int(state["receiver"]["departure_stamp"][source])
+    takeovers = int(state["trust"]["takeovers"]) if source == 0 else 0
+    if departures < FEW_DEPARTURES and not takeovers:
         return []
-    stamp = int(state["receiver"]["departure_stamp"][source]) * 1e-9
+    if not departures:
+        stamp = int(state["trust"]["doubt_stamp"])
     return [
-        f"the receiver{_of(source)} and the IMU went different ways {departures} times, first at the stamp "
-        f"{stamp:.1f}: multipath or spoofing; or {NOISY_IMU}"
+        f"the receiver{_of(source)} and the IMU went different ways {departures + takeovers} times, once at the stamp "
+        f"{stamp * 1e-9:.1f}: multipath or spoofing; or {NOISY_IMU}"
     ]
 
 
