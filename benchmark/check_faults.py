@@ -2,15 +2,14 @@
 
     python benchmark/check_faults.py [--seeds 5] [--only WORD] [--no-filter] [--out docs/check.md]
 
-Every fault of `benchmark/faults.py`, and those of messages as drivers send them, is put into simulated city drives of
-286 s that are written to a recording. Counted are the runs that name the fault by one of the expected findings, and all
+Faults of `benchmark/faults.py`, and those of messages as drivers send them, are put into simulated city drives of 286 s
+that are written to a recording. Counted are the runs that name the fault by one of the expected findings, and all
 other warnings and errors. The parameters are the defaults with mounting and lever arm of the drive.
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import math
 import sys
 import tempfile
@@ -24,6 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
+from campaign.fault import BEGIN, RATE, STOP, Fault
+from campaign.running import parameters_of, recording_of
 from eskf_ros.bags import BagWriter
 from eskf_ros.doctor.examine import check
 from eskf_ros.doctor.finding import Finding, Severity
@@ -32,8 +33,8 @@ from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.frames import STRINGS
 from eskf_ros.simulate.messages import topics_of
 from eskf_ros.simulate.scenario import Recording, simulate
+from faults import all_faults
 from markdown_table import table
-from sample_faults import BEGIN, FAULTS, RATE, STOP, Fault, Samples, parameters_of
 
 Messages = NDArray[Any]
 Change = Callable[[Messages, NDArray[np.int64], np.random.Generator], tuple[Messages, NDArray[np.int64]]]
@@ -45,7 +46,7 @@ NAMES = {
     "accelerometer bias step 0.3 m/s2": ("filter: accelerometer",),
     "gyro bias ramp 0.5 deg/s in 400 s": ("gyro_wanders",),
     "scale 1.5 %": ("gravity_scale",),
-    "ten times the noise": (),
+    "10 times the noise": (),
     "rates clipped at 0.2 rad/s": ("clipped",),
     "shocks of 100 m/s2, 8 rad/s": ("shocks",),
     "vibration 1 m/s2, 0.05 rad/s": ("noise_told_small",),
@@ -53,20 +54,23 @@ NAMES = {
     "holes of 1.6 s, dropped": ("imu_gaps",),
     "holes of 1.6 s, bridged by lines": ("bridged_samples",),
     "holes of 1.6 s, last sample repeated": ("repeated_samples",),
-    "stamps jittered by 1 ms": ("stamp_jitter",),
-    "stamps in bursts of four": ("stamp_bursts",),
+    "stamps jittered by 1 ms, late by 0 ms": ("stamp_jitter",),
+    "stamps in bursts of 4": ("stamp_bursts",),
     "IMU yaw 5 deg off": ("mounting_yaw",),
     "IMU yaw 90 deg off": ("mounting_yaw",),
-    "lever arm 1.5 m off": ("filter: antenna",),
+    "lever arm 1.5 m off in x": ("filter: antenna",),
     "heading given 120 deg wrong": ("filter: heading",),
     "positions stamped 0.25 s late": ("position_late",),
     "velocities stamped 0.13 s late": ("velocity_late",),
     "lasting errors 1.5 m, 60 s": ("lasting_errors",),
     "steps of 15 m, 20 s every minute": ("position_steps",),
-    "position drawn away by 0.5 m/s": ("position_drawn_away", "position_steps"),
+    "drawn away by 0.5 m/s, velocity true": ("position_drawn_away", "position_steps"),
     "frozen coordinates for 40 s": ("frozen_fixes",),
 }
 """Findings by which a fault of `faults.py` counts as named; "filter: WORD": a sentence of the monitors with it."""
+
+FAULTS = tuple(fault for fault in all_faults() if fault.name in NAMES)
+"""A part of the closed list of faults."""
 
 SEVERITIES = {Severity.NOTE: "note", Severity.WARNING: "warning", Severity.ERROR: "error"}
 
@@ -187,25 +191,6 @@ MESSAGE_FAULTS = (
 )
 
 
-def faulty(fault: Fault, seed: int) -> Recording:
-    """A drive with a fault of `faults.py`."""
-    clean = simulate("drive", seed, imu_rate=RATE, stop=STOP)
-    rng = np.random.default_rng(10_000 + seed)
-    seconds = (clean.imu_stamp - clean.imu_stamp[0]) * 1e-9
-    everything = np.ones(len(clean.imu_stamp), bool)
-    force, rate = clean.specific_force.copy(), clean.angular_rate.copy()
-    samples = Samples(clean.imu_stamp.copy(), force, rate, everything, seconds)
-    if fault.imu is not None:
-        fault.imu(samples, rng)
-    kept = np.flatnonzero(samples.kept)
-    # A stamp is never later than the arrival.
-    arrival = np.maximum(clean.imu_arrival, samples.stamps)[kept]
-    changes = {"imu_stamp": samples.stamps[kept], "imu_arrival": np.maximum.accumulate(arrival)}
-    changes |= {"specific_force": samples.force[kept], "angular_rate": samples.rate[kept]}
-    recording = clean if fault.gnss is None else fault.gnss(clean, rng)
-    return dataclasses.replace(recording, **changes)
-
-
 def write_bag(path: Path, recording: Recording, fault: MessageFault | None, seed: int) -> None:
     """Write a drive, its messages changed by a fault."""
     rng = np.random.default_rng(20_000 + seed)
@@ -223,7 +208,7 @@ def write_bag(path: Path, recording: Recording, fault: MessageFault | None, seed
 def examined(fault: Fault | MessageFault, seed: int, runs_filter: bool) -> list[Finding]:
     """The findings on one drive with a fault."""
     if isinstance(fault, Fault):
-        recording, message_fault = faulty(fault, seed), None
+        recording, message_fault = recording_of(fault, seed), None
         parameters = parameters_of(fault, recording, is_told=False)
     else:
         recording, message_fault = simulate("drive", seed, imu_rate=RATE, stop=STOP, **fault.options), fault

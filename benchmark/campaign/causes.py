@@ -10,7 +10,7 @@ import re
 
 CAUSES = {
     "IMU stamps": r"(stamps of the IMU|IMU('s)? (samples|stamps)|IMU is stamped).*(jitter|scatter|burst|irregular"
-    r"|uneven|late|share|same stamp)",
+    r"|uneven|late|share|same stamp|stamp of another)",
     "IMU holes": r"(samples|IMU|readings).*(missing|hole|gap|bridged|straight line|repeat)",
     "clipping": r"clip|saturat|end of (its|their) range",
     "shocks": r"\b(shock|blow|spike)",

@@ -4,7 +4,20 @@ from __future__ import annotations
 
 import math
 
-from campaign.fault import BEGIN, END, MOVING, RATE, STOP, VEHICLES, Fault, Kind
+from campaign.fault import (
+    BEGIN,
+    DEFAULT_POSITION,
+    DEFAULT_VELOCITY,
+    END,
+    MOVING,
+    RATE,
+    STOP,
+    TOLD_POSITION,
+    TOLD_VELOCITY,
+    VEHICLES,
+    Fault,
+    Kind,
+)
 from eskf_ros.simulate.episodes import ClockSet, Episode
 from eskf_ros.simulate.imu_episodes import (
     ImuBias,
@@ -42,6 +55,7 @@ def imu_faults(amplitude: float = 1.0) -> list[Fault]:
     """Return the faults, their sizes times ``amplitude``."""
     a = amplitude
     hole = min(1.6 * a, 9.0)
+    noise = ImuNoise(0.0, FOR_GOOD, 5e-4 * a, 6e-3 * a)
     holes = {"end": END, "names": ("IMU holes",), "also": NOISE}
     return [
         *(
@@ -49,7 +63,19 @@ def imu_faults(amplitude: float = 1.0) -> list[Fault]:
             for filled, what in (("no", "dropped"), ("lines", "bridged by lines"), ("repeats", "last sample repeated"))
         ),
         *_stamps(a),
-        _throughout(f"{10 * a:.3g} times the noise", ImuNoise(0.0, FOR_GOOD, 5e-4 * a, 6e-3 * a), names=NOISE),
+        _throughout(
+            f"{10 * a:.3g} times the noise",
+            noise,
+            names=NOISE,
+            filters=(TOLD_VELOCITY, TOLD_POSITION),
+            vehicles=(),
+        ),
+        _throughout(
+            f"{10 * a:.3g} times the noise, within the defaults",
+            noise,
+            also=NOISE,
+            filters=(DEFAULT_VELOCITY, DEFAULT_POSITION),
+        ),
         _fault(
             f"gyro bias step {a:.3g} deg/s", ImuBias(BEGIN, FOR_GOOD, (0.0, 0.0, a)), names=("IMU bias",), also=NOISE
         ),
@@ -153,9 +179,10 @@ def _rates() -> list[Fault]:
             Kind.IMU,
             options={"imu_rate": rate, "truth_rate": 50.0 if rate > RATE else min(rate, 50.0)},
             begin=MOVING,
-            names=("low rate",) if rate <= 10.0 else (),
+            # At 10 Hz no interval is longer than `imu.gap`.
+            names=("low rate",) if rate < 10.0 else (),
             also=("low rate", "IMU holes"),
-            is_judged_by_name_alone=rate <= 10.0,
+            is_judged_by_name_alone=rate < 10.0,
             stop=STOP,
         )
         for rate in (5.0, 10.0, 25.0, 50.0, 200.0, 400.0)

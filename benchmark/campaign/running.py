@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from eskf_ros.filter.history.records import RECORD
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import SENSOR_STREAMS, Stream, Verdict
 from eskf_ros.parameters.mapping import from_mapping
+from eskf_ros.simulate.episodes import ClockSet
 from eskf_ros.simulate.imu import ImuMount
 from eskf_ros.simulate.scenario import Recording, simulate
 from eskf_ros.tables.feeding import rows_from
@@ -152,7 +153,7 @@ def run_one(
     states: list[np.ndarray] = []
     records = []
     said: dict[str, float] = {}
-    for k, (_, state) in enumerate(feed(recording, navigator, stops, messages)):
+    for k, state in enumerate(states_at(stops, recording, navigator, messages, has_order_of_arrival(fault))):
         if states or state["position_known"]:
             states.append(state.copy())
         if k % ASKED_EVERY == 0:
@@ -166,6 +167,24 @@ def run_one(
     if not states:  # The filter never started: it claims nothing, and has nothing but its word.
         states.append(state.copy())
     return _trace(recording, navigator, stops, np.array(states), np.concatenate(records, dtype=RECORD), said, final)
+
+
+def has_order_of_arrival(fault: Fault) -> bool:
+    """Whether the order of arrival makes a difference: it does where a clock is set, and nowhere else."""
+    return any(isinstance(episode, ClockSet) for episode in fault.episodes)
+
+
+def states_at(
+    stops: NDArray[np.int64], recording: Recording, navigator: Navigator, messages: Sequence[Message], in_order: bool
+) -> Iterator[np.ndarray]:
+    """Yield the state after each of the IMU samples ``stops``; ``in_order``: messages are not handed over in bulk."""
+    if not in_order:
+        yield from (state for _, state in feed(recording, navigator, stops, messages))
+        return
+    wanted = set(stops.tolist())
+    for i, state in feed(recording, navigator, np.arange(stops[-1] + 1), messages):
+        if i in wanted:
+            yield state
 
 
 def sentences(navigator: Navigator) -> list[str]:

@@ -13,6 +13,7 @@ from eskf_ros.filter.history.timeline import open_record
 from eskf_ros.filter.inertial.navigation_frame import heading_of
 from eskf_ros.filter.integrity.heading_monitor import watch_course, watch_field, watch_heading
 from eskf_ros.filter.integrity.installation_monitor import find_faults, learn_faults
+from eskf_ros.filter.integrity.motion_monitor import watch_motion
 from eskf_ros.filter.integrity.receiver import fuse_receiver, reset_for_new_solution
 from eskf_ros.filter.integrity.receiver_monitor import watch_receiver
 from eskf_ros.filter.integrity.recovery import note, recover
@@ -69,6 +70,7 @@ def fuse(states, aids, i, settings, work):
         return
     if aid.stream == Stream.GNSS_POSITION:
         gnss_position.fill_altitude(state, aid.payload, aid.source, settings)
+    watch_motion(state, aid, settings)
     update_motion_evidence(state, aid, settings)
     if aid.stream == Stream.GNSS_POSITION and state.level_known == 1 and state.position_known == 0:
         begin(state, aid, settings)

@@ -26,6 +26,7 @@ from eskf_ros.filter.integrity.heading_monitor import HEADING_MONITOR
 from eskf_ros.filter.integrity.humble_lane import TRUST
 from eskf_ros.filter.integrity.imu_monitor import IMU_MONITOR
 from eskf_ros.filter.integrity.installation_monitor import FAULTS, INSTALLATION
+from eskf_ros.filter.integrity.motion_monitor import MOTION
 from eskf_ros.filter.integrity.receiver_monitor import RECEIVER_MONITOR
 from eskf_ros.filter.integrity.recovery import RECOVERY
 from eskf_ros.filter.integrity.repeated_fixes import REPEATED_FIXES
@@ -104,6 +105,7 @@ STATE = np.dtype(
         ("corrections", CORRECTIONS),
         ("receiver", RECEIVER_MONITOR),
         ("installation", INSTALLATION),
+        ("motion", MOTION),
         ("mag", EARTH_FIELD),
         ("tight", TIGHT),
         ("streams", STREAMS),
@@ -256,6 +258,7 @@ _NEVER = {
     "corrections": ("since",),
     "scatter": ("last_stamp", "walk_stamp"),
     "installation": ("stamp", "checked"),
+    "motion": ("fix_stamp", "heard_stamp", "velocity_stamp", "start_stamp", "last_stamp", "pause_stamp", "clock_stamp"),
     "mag": ("disturbed_stamp",),
     "heading": ("given_stamp", "tried_stamp", "contradicted_since"),
     "rest": (

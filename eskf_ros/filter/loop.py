@@ -11,6 +11,7 @@ from eskf_ros.filter.inertial.sample_quality import copy_doubt, judge_sample
 from eskf_ros.filter.inertial.stamps import take_stamp
 from eskf_ros.filter.inertial.strapdown import SMOOTHING_TIME
 from eskf_ros.filter.integrity.imu_monitor import watch_input, watch_interval
+from eskf_ros.filter.integrity.motion_monitor import add_sample
 from eskf_ros.filter.integrity.restart import reset_alignment
 from eskf_ros.filter.output.forward_log import close_node, log_sample, open_node
 from eskf_ros.filter.output.global_odometry import write_odometry
@@ -52,6 +53,7 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
         if is_running(states):
             take_sample(states[HUMBLE], sample, instant)
         watch_interval(state, settings)
+        add_sample(state)
         measure_step(state, settings)
         update_rest(state, settings)
         add_to_block(state, settings)

@@ -12,11 +12,12 @@ from eskf_ros.filter.history.buffers import Buffers
 from eskf_ros.filter.history.clock_steps import ClockSteps, Step
 from eskf_ros.filter.history.records import RECORD
 from eskf_ros.filter.integrity.heading_monitor import is_heading_contradicted
+from eskf_ros.filter.integrity.motion_report import motion_complaints, travel_complaints
 from eskf_ros.filter.integrity.receiver_report import aid_complaints, aid_notes
 from eskf_ros.filter.integrity.recovery import phase_of
 from eskf_ros.filter.integrity.repeated_fixes import repeat_complaints
-from eskf_ros.filter.integrity.report import complaints
-from eskf_ros.filter.integrity.sample_report import sample_complaints
+from eskf_ros.filter.integrity.report import gap_complaints, imu_faults, other_complaints
+from eskf_ros.filter.integrity.sample_report import axis_complaints, sample_complaints
 from eskf_ros.filter.integrity.traffic import Traffic, imu_complaints
 from eskf_ros.filter.layout import STATE
 from eskf_ros.filter.output.global_odometry import ODOMETRY, write_odometry
@@ -27,11 +28,13 @@ from eskf_ros.filter.state.memory import allocate
 from eskf_ros.filter.state.time import NEVER, SECOND
 from eskf_ros.geodesy.earth import east_north_up_to_ecef, ecef_to_geodetic
 from eskf_ros.geodesy.rotation import to_matrix
+from eskf_ros.parameters.tree import Parameters
 
 
 class Readout:
     """The readable side of a `Navigator`, which owns the data."""
 
+    parameters: Parameters
     _states: np.ndarray
     _settings: np.ndarray
     _local: np.ndarray
@@ -195,22 +198,28 @@ class Readout:
     @property
     def complaints(self) -> list[str]:
         """One sentence for each fault of a stream, with what to do; empty without faults."""
-        state = self._states[0]
-        found = complaints(state) + repeat_complaints(state) + sample_complaints(state)
+        state, settings = self._states[0], self._settings[0]
+        clocks = self._clock.complaints() + self._traffic.complaints()
+        clocks += imu_complaints(self.imu_counts, self.window_needed)
+        inertial = imu_faults(state) + motion_complaints(state)
+        samples = sample_complaints(state) + gap_complaints(state)
+        travel, is_fault = travel_complaints(state, settings, self.parameters.imu.mount_rpy_deg)
+        found = inertial + other_complaints(state) + repeat_complaints(state) + samples + (travel if is_fault else [])
         # A wrong heading makes the fixes look faulty: warnings about the receivers would mislead.
         if not is_heading_contradicted(state):
-            found += aid_complaints(state, self._settings[0])
-        return (
-            found
-            + self._clock.complaints()
-            + self._traffic.complaints()
-            + imu_complaints(self.imu_counts, self.window_needed)
-        )
+            found += aid_complaints(
+                state, settings, bool(clocks or inertial or axis_complaints(state)), bool(samples or travel)
+            )
+        return found + clocks
 
     @property
     def notes(self) -> list[str]:
         """One sentence for each fact worth knowing of the streams though nothing is wrong."""
-        return self._traffic.notes() + aid_notes(self._states[0])
+        state, settings = self._states[0], self._settings[0]
+        travel, is_fault = travel_complaints(state, settings, self.parameters.imu.mount_rpy_deg)
+        # Without altitudes fixes change by less than their three axes claim.
+        of_errors = [] if self._traffic.without_altitude else aid_notes(state)
+        return self._traffic.notes() + of_errors + ([] if is_fault else travel)
 
     @property
     def held_bytes(self) -> int:

@@ -65,7 +65,6 @@ def test_without_a_fault_nothing_is_said(name: str, options: dict[str, Any], cha
         assert navigated(name, seed, changes, **options).complaints == []
 
 
-@pytest.mark.xfail(reason="takeovers by the humble lane cost the installation monitor evidence", strict=False)
 @pytest.mark.parametrize(
     ("error", "changes", "options", "tolerance"),
     [
@@ -86,7 +85,6 @@ def test_a_wrong_lever_arm_is_named(
     assert numbers(sentence)[:3] == pytest.approx(error, abs=tolerance)
 
 
-@pytest.mark.xfail(reason="takeovers by the humble lane cost the installation monitor evidence", strict=False)
 @pytest.mark.parametrize(
     ("offset", "changes", "options"), [(0.1, {}, {}), (-0.15, {}, {}), (0.15, POSITION_ONLY, {}), (0.02, {}, RTK)]
 )
@@ -112,7 +110,6 @@ def test_fixes_that_are_drawn_away_are_named() -> None:
     assert "multipath or spoofing" in sentence
 
 
-@pytest.mark.xfail(reason="takeovers by the humble lane cost the installation monitor evidence", strict=False)
 def test_a_receiver_that_lies_consistently_is_caught_by_the_imu() -> None:
     complaints = navigated("drive", 9, stop=130.0, episodes=(Spoofing(100.0, 60.0, (5.0, 0.0, 0.0), 0.5),)).complaints
     (sentence,) = (text for text in complaints if "IMU went different ways" in text)
@@ -137,7 +134,6 @@ def test_covariances_that_are_too_small_are_named(changes: dict[str, Any]) -> No
     assert numbers(complaints[0])[-1] == pytest.approx(9.0, rel=0.5)
 
 
-@pytest.mark.xfail(reason="takeovers by the humble lane cost the installation monitor evidence", strict=False)
 def test_velocities_that_claim_too_much_are_named() -> None:
     changes = {"gnss.covariance_scale": 0.1, "gnss.position_std_floor": 1.0}
     sentence = navigated("drive", 10, changes).complaints[0]
@@ -145,7 +141,7 @@ def test_velocities_that_claim_too_much_are_named() -> None:
     assert 1.5 < numbers(sentence)[0] < 3.5
 
 
-@pytest.mark.xfail(reason="takeovers by the humble lane cost the installation monitor evidence", strict=False)
+@pytest.mark.xfail(reason="changes of fixes count for nothing where the humble lane is wide", strict=False)
 def test_covariances_that_are_too_large_are_named() -> None:
     """What is left of the claim may last: that is modelled, and said as a note."""
     navigator = navigated("drive", 10, {"gnss.covariance_scale": 100.0})
@@ -155,7 +151,7 @@ def test_covariances_that_are_too_large_are_named() -> None:
     assert "gnss.correlation_time" in sentence
 
 
-@pytest.mark.xfail(reason="takeovers by the humble lane cost the installation monitor evidence", strict=False)
+@pytest.mark.xfail(reason="2.0 times instead of more: takeovers widen the noise in time", strict=False)
 def test_a_filter_that_is_too_sure_of_itself_in_outages_is_named() -> None:
     noise = {name: value for name, value in grade_parameters("tactical").items() if "std" not in name}
     complaints = navigated("drive", 11, {**noise, **POSITION_ONLY}, grade="consumer", episodes=OUTAGES).complaints

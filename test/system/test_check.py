@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 import eskf_ros
-from check_faults import FAULTS, MESSAGE_FAULTS, MessageFault, faulty, write_bag
+from campaign.fault import Fault
+from campaign.running import recording_of
+from check_faults import FAULTS, MESSAGE_FAULTS, MessageFault, write_bag
 from eskf_ros.bags import BagWriter, message_dtype
 from eskf_ros.doctor.finding import Severity
 from eskf_ros.doctor.main import main
@@ -21,7 +23,6 @@ from eskf_ros.parameters.ros_yaml import load
 from eskf_ros.simulate.frames import STRINGS
 from eskf_ros.simulate.messages import topics_of
 from eskf_ros.simulate.scenario import Recording, simulate
-from sample_faults import Fault
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 BAG = CHECKOUT / "bags" / "tunnel_drive.mcap"
@@ -79,8 +80,8 @@ EXPECTED = {
     "holes of 1.6 s, dropped": {"imu_gaps"},
     "holes of 1.6 s, bridged by lines": {"bridged_samples"},
     "holes of 1.6 s, last sample repeated": {"repeated_samples"},
-    "stamps jittered by 1 ms": {"stamp_jitter"},
-    "stamps in bursts of four": {"stamp_bursts"},
+    "stamps jittered by 1 ms, late by 0 ms": {"stamp_jitter"},
+    "stamps in bursts of 4": {"stamp_bursts"},
     "positions stamped 0.25 s late": {"position_late"},
     "velocities stamped 0.13 s late": {"velocity_late"},
     "steps of 15 m, 20 s every minute": {"position_steps"},
@@ -90,12 +91,12 @@ EXPECTED = {
 
 @pytest.mark.parametrize("fault", [f for f in FAULTS if f.name in EXPECTED], ids=lambda fault: fault.name)
 def test_faults_of_the_campaign_are_named_and_nothing_else(examine: Examine, fault: Fault) -> None:
-    assert named(examine(faulty(fault, 2), None)) == EXPECTED[fault.name]
+    assert named(examine(recording_of(fault, 2), None)) == EXPECTED[fault.name]
 
 
 def test_a_remedy_that_is_followed_is_right(examine: Examine, tmp_path: Path) -> None:
     late = next(fault for fault in FAULTS if fault.name == "positions stamped 0.25 s late")
-    parameters = examine(faulty(late, 2), None).named("position_late")[0].parameters
+    parameters = examine(recording_of(late, 2), None).named("position_late")[0].parameters
     assert parameters["gnss.time_offset"] == pytest.approx(-0.25, abs=0.03)
     again = eskf_ros.check(tmp_path / "bag.mcap", from_mapping({**LEVER_ARM, **parameters}), runs_filter=False)
     assert named(again) == set()

@@ -84,6 +84,27 @@ def test_velocities_stamped_late_are_harmless_once_their_offset_is_given() -> No
 
 
 @pytest.mark.parametrize(
+    "name",
+    [
+        "holes of 1.6 s, dropped",
+        "rates clipped at 0.2 rad/s",
+        "one gyro axis negated",
+        "accelerometer x and y swapped",
+        "IMU yaw 8 deg off",
+        "velocity in north, east, down",
+        "clocks of IMU and receiver 1.2 s apart",
+        "clock set by +0.5 s for the rest",
+        "clock set by +10 s for the rest",
+        "clock set by -0.5 s for the rest",
+    ],
+)
+def test_a_fault_is_named_and_no_other(name: str) -> None:
+    figures = figures_of(BY_NAME[name], run_named(name, DEFAULT_VELOCITY))
+    assert math.isfinite(figures.named_after)
+    assert not figures.wrong
+
+
+@pytest.mark.parametrize(
     ("name", "given", "parameter"),
     [
         ("positions stamped 0.25 s late", TOLD_POSITION, "gnss.time_offset"),

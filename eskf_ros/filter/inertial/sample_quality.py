@@ -28,6 +28,7 @@ SAMPLE_QUALITY = np.dtype(
         ("bend", "f8", (6,)),
         ("lowest", "f8", (6,)),
         ("highest", "f8", (6,)),
+        ("at_extreme", "i8", (6, 2)),
         ("least_jump", "f8", (6,)),
         ("equal_share", "f8", (6,)),
         ("any_equal", "i8"),
@@ -59,7 +60,7 @@ SAMPLE_QUALITY = np.dtype(
 
 - ``count``: samples judged. ``change``, ``bend``: running mean squares of the first and second differences.
 - ``least_jump``: square of the smallest change that is a jump, whatever is usual; a constant.
-- ``lowest``, ``highest``: the smallest and largest readings.
+- ``lowest``, ``highest``: the smallest and largest readings; ``at_extreme``: how often they were read.
 - ``equal_share``: share of the samples that repeat the one before, by axis; ``equal_count``, ``equal_time``: how often
   and for how long (s) the last reading was repeated; ``equal_paid``: up to which time that is in the covariance (s);
   ``any_equal``: whether an axis repeats its reading now.
@@ -236,8 +237,12 @@ def learn(quality, i, new, change, bend, is_equal, weight):
     ``bend`` is the square of the second difference, ``weight`` that of a new sample in the shares. Nothing is learnt of
     noise where the readings are on a line.
     """
-    quality.lowest[i] = min(quality.lowest[i], new)
-    quality.highest[i] = max(quality.highest[i], new)
+    if new <= quality.lowest[i]:
+        quality.at_extreme[i, 0] = quality.at_extreme[i, 0] + 1 if new == quality.lowest[i] else 1
+        quality.lowest[i] = new
+    if new >= quality.highest[i]:
+        quality.at_extreme[i, 1] = quality.at_extreme[i, 1] + 1 if new == quality.highest[i] else 1
+        quality.highest[i] = new
     share = quality.equal_share[i]
     quality.equal_share[i] = max(share + weight * (is_equal - share), LEAST_SHARE)
     is_first = quality.count <= FIRST_SAMPLES
@@ -302,6 +307,12 @@ def watch_axis(state, quality, i, interval, settings):
     """Widen one axis that keeps its value beyond all chance while others move."""
     value = last_reading(state, i)
     is_clipped = value <= quality.lowest[i] or value >= quality.highest[i]
+    # What is stuck a second time at the same size is clipped, although more has been read before.
+    again = quality.equal_paid[i] == 0.0 and quality.stuck_time[i] > 0.0
+    if (again or quality.clipped_time[i] > 0.0) and abs(value) == abs(quality.stuck_value[i]):
+        is_clipped = True
+        quality.clipped_time[i] += quality.stuck_time[i]
+        quality.stuck_time[i] = 0.0
     if not is_clipped and quality.equal_time[i] < STUCK_AFTER:
         return
     if is_usual(quality, quality.equal_share[i], USUAL_EQUAL, quality.equal_count[i]) or is_standing(state):

@@ -17,7 +17,7 @@ from eskf_ros.filter.measurements.kalman_update import invert_positive
 from eskf_ros.filter.state.enums import Stream, Verdict
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, SOURCES, VELOCITY
 from eskf_ros.filter.state.time import NEVER, SECOND
-from eskf_ros.geodesy.rotation import cross, rotate, rotate_back, to_matrix
+from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix
 
 FAULTS = 5
 """Faults that are estimated for each receiver: three axes of the lever arm (m, body), and the time offsets (s) of
@@ -34,6 +34,12 @@ LASTING_TIME = 60.0
 
 LEAST_INTERVAL = 0.05
 """s; interval of fixes below which more of them do not say more."""
+
+CERTAIN_SHARE = 2.0
+"""Ratio of the square of an acceleration to its variance below which it says nothing of the time of velocities."""
+
+LARGEST_FAULT = 3.0
+"""Prior standard deviations; an estimate beyond is no fault of the installation, whatever it is."""
 
 MEMORY = 600.0
 """s; time constant with which the normal equations of the faults forget."""
@@ -53,6 +59,9 @@ TIME_ERROR = 0.01
 LEAKAGE = 0.3
 """Share of the significance of the most certain fault above which another is certain, too."""
 
+LASTING_LOOKS = 6
+"""Looks in a row at which a fault must be certain to be reported: errors that last look like one for a while."""
+
 CHECK_INTERVAL = 5 * SECOND
 """ns; time between two looks at the estimated faults."""
 
@@ -66,6 +75,7 @@ INSTALLATION = np.dtype(
         ("checked", "i8"),
         ("found", "f8", (SOURCES, FAULTS)),
         ("sigma", "f8", (SOURCES, FAULTS)),
+        ("held", "i8", (SOURCES, FAULTS)),
     ],
     align=True,
 )
@@ -75,7 +85,8 @@ INSTALLATION = np.dtype(
 - ``absorbed``: derivative of the 15 errors of the core by the faults.
 - ``information``, ``evidence``: normal equations of the faults.
 - ``checked``: when they were solved last (ns).
-- ``found``, ``sigma``: faults that are certain, true minus configured, else 0, and their standard deviations.
+- ``found``, ``sigma``: faults that are certain, true minus configured, else 0, and their standard deviations;
+  ``held``: for how many looks in a row they have been so.
 """
 
 
@@ -89,42 +100,79 @@ def write_effect(state, aid, work, settings):
     for i in range(3):
         for k in range(FAULTS):
             effect[i, k] = 0.0
-    rotation = to_matrix(state.attitude)
     if aid.stream == Stream.GNSS_POSITION:
-        rate = smoothed_rate(state, rotation)
-        turning = rotate(rotation, cross(rate, settings.lever_arms_body[aid.source]))
-        for i in range(3):
-            for k in range(3):
-                effect[i, k] = rotation[i][k]
-            effect[i, POSITION_TIME] = state.velocity_map[i] + turning[i]
+        write_effect_on_position(state, aid.source, effect, settings)
     elif aid.stream == Stream.GNSS_VELOCITY:
-        rate = smoothed_rate(state, rotation)
-        force, bias = state.imu.smooth_force, state.accel_bias
-        felt = rotate(rotation, (force[0] - bias[0], force[1] - bias[1], force[2] - bias[2]))
-        gravity = gravity_map(state, (state.position_map[0], state.position_map[1], state.position_map[2]))
-        x = rotate(rotation, cross(rate, (1.0, 0.0, 0.0)))
-        y = rotate(rotation, cross(rate, (0.0, 1.0, 0.0)))
-        z = rotate(rotation, cross(rate, (0.0, 0.0, 1.0)))
-        for i in range(3):
-            effect[i, 0], effect[i, 1], effect[i, 2] = x[i], y[i], z[i]
-            effect[i, VELOCITY_TIME] = felt[i] + gravity[i]
+        write_effect_on_velocity(state, effect)
+
+
+@njit
+def write_effect_on_position(state, source, effect, settings):
+    """Write the derivative of a position by the faults of its receiver to the first rows of ``effect``."""
+    rotation = to_matrix(state.attitude)
+    turning = rotate(rotation, cross(smoothed_rate(state, rotation), settings.lever_arms_body[source]))
+    for i in range(3):
+        for k in range(3):
+            effect[i, k] = rotation[i][k]
+        effect[i, POSITION_TIME] = state.velocity_map[i] + turning[i]
+
+
+@njit
+def write_effect_on_velocity(state, effect):
+    """Write the derivative of a velocity by the faults of its receiver to the first rows of ``effect``.
+
+    An acceleration that is not larger than what tilt and bias leave unknown of it says nothing: it would be explained
+    by the same errors as the innovation.
+    """
+    rotation = to_matrix(state.attitude)
+    rate = smoothed_rate(state, rotation)
+    force, bias = state.imu.smooth_force, state.accel_bias
+    felt = rotate(rotation, (force[0] - bias[0], force[1] - bias[1], force[2] - bias[2]))
+    gravity = gravity_map(state, (state.position_map[0], state.position_map[1], state.position_map[2]))
+    acceleration = (felt[0] + gravity[0], felt[1] + gravity[1], felt[2] + gravity[2])
+    unknown = dot(gravity, gravity) * (
+        state.covariance[ATTITUDE, ATTITUDE] + state.covariance[ATTITUDE + 1, ATTITUDE + 1]
+    )
+    for i in range(3):
+        unknown += state.covariance[ACCEL_BIAS + i, ACCEL_BIAS + i]
+    square = dot(acceleration, acceleration)
+    share = square / (square + unknown) if square > CERTAIN_SHARE * unknown else 0.0
+    x = rotate(rotation, cross(rate, (1.0, 0.0, 0.0)))
+    y = rotate(rotation, cross(rate, (0.0, 1.0, 0.0)))
+    z = rotate(rotation, cross(rate, (0.0, 0.0, 1.0)))
+    for i in range(3):
+        effect[i, 0], effect[i, 1], effect[i, 2] = x[i], y[i], z[i]
+        effect[i, VELOCITY_TIME] = share * acceleration[i]
+
+
+@njit
+def absorb_completely(state, settings):
+    """Begin to carry the effect of the faults: position and velocity have followed the receivers with all of it.
+
+    So it is at the start, and when the filter goes on from the humble lane, which follows the receivers.
+    """
+    for source in range(SOURCES):
+        absorbed = state.installation.absorbed[source]
+        absorbed.fill(0.0)
+        write_effect_on_position(state, source, absorbed[POSITION:VELOCITY], settings)
+        write_effect_on_velocity(state, absorbed[VELOCITY:ATTITUDE])
 
 
 @njit
 def learn_faults(state, aid, size, gate, work, settings):
     """Carry the effect of the faults on the state through one update, and learn from its innovation."""
     if state.heading_known == 0 or aid.verdict in (Verdict.RESET, Verdict.TAKEOVER):
-        # What was learnt from an estimate that was wrong goes with it.
         state.installation.stamp = NEVER
         if aid.verdict == Verdict.TAKEOVER:
-            # A wrong lever arm or time offset may be why the filter seemed wrong.
+            # A wrong lever arm or time offset may be why the filter seemed wrong: the evidence stays.
             return
+        # What was learnt from an estimate that was wrong goes with it.
         state.installation.information.fill(0.0)
         state.installation.evidence.fill(0.0)
         state.installation.found.fill(0.0)
         return
     if state.installation.stamp == NEVER:
-        state.installation.absorbed.fill(0.0)
+        absorb_completely(state, settings)
     dt = carry_absorbed(state)
     accepted = aid.verdict in (Verdict.FUSED, Verdict.WEIGHED_DOWN, Verdict.TAKEOVER)
     for source in range(SOURCES):
@@ -245,8 +293,11 @@ def find_faults(state, work):
         for k in range(FAULTS):
             least = TIME_ERROR if k >= POSITION_TIME else LEVER_ARM_ERROR
             estimate, sigma = state.installation.found[source, k], state.installation.sigma[source, k]
-            if abs(estimate) < max(FAULT_SIGMAS, LEAKAGE * largest) * sigma or abs(estimate) < least:
+            is_small = abs(estimate) < max(FAULT_SIGMAS, LEAKAGE * largest) * sigma or abs(estimate) < least
+            if is_small or abs(estimate) > LARGEST_FAULT * FAULT_PRIOR[k]:
                 state.installation.found[source, k] = 0.0
+            is_certain = state.installation.found[source, k] != 0.0
+            state.installation.held[source, k] = state.installation.held[source, k] + 1 if is_certain else 0
 
 
 @njit
@@ -262,7 +313,15 @@ def fixes_together(state, source):
 
 @njit
 def unmodelled_position(state, source):
-    """Return the length (m) by which fixes are off by what was found: wrong lever arm, positions at the wrong time."""
-    found, v = state.installation.found[source], state.velocity_map
-    way = found[POSITION_TIME] ** 2 * (v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
-    return math.sqrt(found[0] ** 2 + found[1] ** 2 + found[2] ** 2 + way)
+    """Return the horizontal length (m) by which fixes are off by what was found for long.
+
+    Wrong lever arm (a vertical one is in the height), positions at the wrong time.
+    """
+    found, held, v = state.installation.found[source], state.installation.held[source], state.velocity_map
+    square = 0.0
+    for k in range(2):
+        if held[k] >= LASTING_LOOKS:
+            square += found[k] ** 2
+    if held[POSITION_TIME] >= LASTING_LOOKS:
+        square += found[POSITION_TIME] ** 2 * (v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
+    return math.sqrt(square)

@@ -7,7 +7,8 @@ import math
 import numpy as np
 from scipy.special import chdtri
 
-from eskf_ros.filter.integrity.installation_monitor import POSITION_TIME, VELOCITY_TIME
+from eskf_ros.filter.integrity.installation_monitor import LASTING_LOOKS, POSITION_TIME, VELOCITY_TIME
+from eskf_ros.filter.integrity.motion_report import has_compared
 from eskf_ros.filter.integrity.receiver_monitor import (
     FEW_DEPARTURES,
     HIGH_NIS,
@@ -16,22 +17,44 @@ from eskf_ros.filter.integrity.receiver_monitor import (
 )
 from eskf_ros.filter.state.error_state import SOURCES
 
+SCATTERED_VELOCITY = 3.0
+"""Mean square of the velocities about the humble lane, over their variance, from which on they claim too much."""
 
-def aid_complaints(state: np.void, settings: np.void) -> list[str]:
-    """Return one sentence for each fault of the receivers, with what to do; empty without faults."""
-    found = []
+DOUBTFUL_SIGMAS = 15.0
+"""Standard deviations beyond which a fault of the installation is reported although IMU or fixes are at fault, too."""
+
+VERTICAL_SIGMAS = 30.0
+"""The same for a vertical lever arm: it shows by roll and pitch alone, and many other errors go with those."""
+
+NOISY_IMU = (
+    "imu.*_noise_density or imu.*_bias_random_walk is too small for it, its bias changes, or its axes or its scale are "
+    "wrong"
+)
+
+
+def aid_complaints(state: np.void, settings: np.void, is_explained: bool, is_imu_doubtful: bool) -> list[str]:
+    """Return one sentence for each fault of the receivers, with what to do; empty without faults.
+
+    ``is_explained``: clocks or the axes of the IMU are at fault, which would let the receivers look faulty.
+    ``is_imu_doubtful``: samples of the IMU are, which may be taken for a wrong installation.
+    """
+    found: list[str] = []
+    is_certain = has_compared(state) and not is_explained
     for source in range(SOURCES):
-        if state["receiver"]["fix_count"][source] < MANY_FIXES:
+        if is_explained or state["receiver"]["fix_count"][source] < MANY_FIXES:
             continue
-        faults = _fault_complaints(state, settings, source)
         lies = _covariance_complaints(state, source, float(settings["gnss_covariance_scale"]))
+        # Fixes that scatter seem to jump.
+        paths = [] if lies else _path_complaints(state, source)
+        faults = _fault_complaints(state, settings, source, is_imu_doubtful or bool(paths))
         # Those faults explain drifts, contradictions and a high NIS: no sentences of their own.
-        found += faults + lies
-        if not faults and not lies:
-            path = _path_complaints(state, source)
-            found += path or _velocity_complaints(state, source) + _departure_complaints(state, source)
+        found += paths + faults + lies
+        # One that is not certain for long may do so, too; or axes of the IMU, which take their time.
+        is_open = bool(state["installation"]["found"][source].any())
+        if is_certain and not is_open and not paths and not faults and not lies:
+            found += _velocity_complaints(state, source) + _departure_complaints(state, source)
     if state["recovery"]["resets"]:
-        cause = "" if found else ": IMU noise parameters too small, or multipath for many seconds"
+        cause = "" if found or not is_certain else f": multipath for many seconds; or {NOISY_IMU}"
         found.append(
             f"{int(state['recovery']['resets'])} times fixes that agree with each other contradicted the filter for so "
             f"long that position and velocity were reset to them{cause}"
@@ -43,8 +66,14 @@ def _of(source: int) -> str:
     return "" if source == 0 else " of the second receiver"
 
 
-def _fault_complaints(state: np.void, settings: np.void, source: int) -> list[str]:
-    found, sigma = state["installation"]["found"][source], state["installation"]["sigma"][source]
+def _fault_complaints(state: np.void, settings: np.void, source: int, is_doubtful: bool) -> list[str]:
+    found, sigma = state["installation"]["found"][source].copy(), state["installation"]["sigma"][source]
+    found[state["installation"]["held"][source] < LASTING_LOOKS] = 0.0
+    vertical = int(np.argmax(np.abs(settings["imu_to_base"][2])))
+    if abs(found[vertical]) < VERTICAL_SIGMAS * sigma[vertical]:
+        found[vertical] = 0.0
+    if is_doubtful:
+        found[np.abs(found) < DOUBTFUL_SIGMAS * sigma] = 0.0
     group = "gnss" if source == 0 else "second_gnss"
     clock = "ranges" if source == 0 and settings["solves_ranges"] else group
     texts = []
@@ -82,8 +111,8 @@ def _covariance_complaints(state: np.void, source: int, scale: float) -> list[st
         if float(state["scatter"]["change"][source]) < 0.5 * factor:
             return [
                 f"{scattered} of {count} fixes{_of(source)} moved otherwise than the velocities of the same receiver, "
-                f"by {math.sqrt(factor):.1f} times what they claim: multipath or spoofing; this is taken for a lasting "
-                "error of the fixes"
+                f"by {math.sqrt(factor):.1f} times what they claim: multipath or spoofing, or errors that last for "
+                "other reasons; this is allowed for (gnss.correlation_time)"
             ]
         return [
             f"the fixes{_of(source)} scatter {math.sqrt(factor):.1f} times as much as they claim ({scattered} of "
@@ -107,34 +136,41 @@ def aid_notes(state: np.void) -> list[str]:
 
 def _velocity_complaints(state: np.void, source: int) -> list[str]:
     mean, count = (float(value) for value in state["receiver"]["velocity_nis"][source])
+    scatter = float(state["scatter"]["velocity"][source])
+    if count >= 2 * MANY_FIXES and scatter > SCATTERED_VELOCITY:
+        return [
+            f"the velocities{_of(source)} scatter {math.sqrt(scatter):.1f} times as much as they claim, and are used "
+            "so; set gnss.velocity_std_floor"
+        ]
     if count < 2 * MANY_FIXES or mean < HIGH_NIS:
         return []
     return [
         f"the velocities{_of(source)} are {math.sqrt(mean):.1f} times as far from the estimate as the covariances "
-        "allow: they claim too much, or the IMU noise parameters are too small"
+        f"allow: they claim too much; or {NOISY_IMU}"
     ]
 
 
 def _path_complaints(state: np.void, source: int) -> list[str]:
     found = []
     jumps = int(state["trust"]["jumps"][0, source])
-    if jumps:
+    # What the filter takes for a jump may be its own error: the fixes of the first receiver must have jumped, too.
+    if jumps and (source > 0 or state["motion"]["jumps"]):
         length = float(state["trust"]["jump"][0, source])
-        found.append(
-            f"the fixes{_of(source)} jumped {jumps} times, by up to {length:.0f} m, and their velocities did not: "
-            "multipath or spoofing"
-        )
+        found.append(f"the fixes{_of(source)} jumped {jumps} times, by up to {length:.0f} m: multipath or spoofing")
     return found
 
 
 def _departure_complaints(state: np.void, source: int) -> list[str]:
-    departures = int(state["receiver"]["departures"][source])
-    if departures < FEW_DEPARTURES:
+    """Return a sentence if a receiver drifted off the path of the IMU, or the humble lane had to take over."""
+    departures, stamp = int(state["receiver"]["departures"][source]), int(state["receiver"]["departure_stamp"][source])
+    takeovers = int(state["trust"]["takeovers"]) if source == 0 else 0
+    if departures < FEW_DEPARTURES and not takeovers:
         return []
-    stamp = int(state["receiver"]["departure_stamp"][source]) * 1e-9
+    if not departures:
+        stamp = int(state["trust"]["doubt_stamp"])
     return [
-        f"the receiver{_of(source)} and the IMU went different ways {departures} times, first at the stamp "
-        f"{stamp:.1f}: multipath, spoofing, or IMU noise parameters that are too small"
+        f"the receiver{_of(source)} and the IMU went different ways {departures + takeovers} times, once at the stamp "
+        f"{stamp * 1e-9:.1f}: multipath or spoofing; or {NOISY_IMU}"
     ]
 
 

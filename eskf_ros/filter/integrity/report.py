@@ -14,6 +14,12 @@ from eskf_ros.geodesy.earth import STANDARD_GRAVITY
 FEWEST_GAPS = 5
 """Gaps of the IMU from which on their share is judged."""
 
+FEWEST_HOLES = 2
+"""Holes in the data of the IMU from which on they are told."""
+
+LEAST_HOLES = 1.0
+"""s; shorter ones, all together, are not worth a word."""
+
 LONG_REFUSED = 30.0
 """s; velocities that are rejected for longer than this, while messages come, are reported."""
 
@@ -52,8 +58,25 @@ def _rate_complaints(state: np.void) -> list[str]:
     ]
 
 
-def complaints(state: np.void) -> list[str]:
-    """Return one sentence for each fault of IMU, headings and rejected velocities, with what to do."""
+def gap_complaints(state: np.void) -> list[str]:
+    """Return a sentence if samples of the IMU are missing now and then."""
+    monitor = state["imu_monitor"]
+    gaps, length = int(monitor["gaps"]), float(monitor["gap_sum"])
+    if gaps < FEWEST_HOLES or length < LEAST_HOLES or _rate_complaints(state):
+        return []
+    return [
+        f"the data of the IMU have {gaps} holes, {length:.1f} s in all: samples get lost on their way; look at the "
+        "bus, the driver and the load of the computer"
+    ]
+
+
+def other_complaints(state: np.void) -> list[str]:
+    """Return one sentence for each fault of headings and rejected velocities, with what to do."""
+    return heading_complaints(state) + _refused_complaints(state)
+
+
+def imu_faults(state: np.void) -> list[str]:
+    """Return one sentence for each fault of gravity, mounting and rates that the IMU shows by itself."""
     found = []
     if state["imu_monitor"]["odd_gravity_windows"] > max(1, int(state["imu_monitor"]["windows"]) // 4):
         strength = float(state["imu_monitor"]["odd_gravity"])
@@ -79,4 +102,4 @@ def complaints(state: np.void) -> list[str]:
         found.append(
             f"the gyro reads more than {FASTEST_TURN:.0f} rad/s for seconds: is it in deg/s? REP-103 wants rad/s"
         )
-    return found + _rate_complaints(state) + heading_complaints(state) + _refused_complaints(state)
+    return found + _rate_complaints(state)

@@ -14,6 +14,15 @@ LASTING_SHARE = 0.25
 FEWEST_BLOCKS = 4
 """Blocks of uneven stamps, at least, for a word."""
 
+LEAST_STUCK = 8.0
+"""s; an axis that kept its value for less in all may be clipped, which the next time will tell."""
+
+FEWEST_AT_END = 30
+"""Samples at the end of what an axis has ever read, to the last bit, from which on that is the end of its range."""
+
+USUAL_SHARE = 0.1
+"""Share of repeated readings above which a resolution is so coarse that the same extreme comes again by chance."""
+
 LEAST_TIME = 0.3
 """s; an axis that was clipped for less in all is not worth a word."""
 
@@ -34,6 +43,27 @@ def stamp_complaints(state: np.void) -> list[str]:
     return []
 
 
+def axis_complaints(state: np.void) -> list[str]:
+    """Return one sentence for each axis of the IMU that is clipped or stuck."""
+    quality, found = state["quality"], []
+    for i, (axis, unit) in enumerate(zip(AXES, UNITS)):
+        clipped, stuck = float(quality["clipped_time"][i]), float(quality["stuck_time"][i])
+        ends, share = quality["at_extreme"][i], float(quality["equal_share"][i])
+        if ends.max() > FEWEST_AT_END and share < USUAL_SHARE:
+            value = float((quality["lowest"] if ends[0] > ends[1] else quality["highest"])[i])
+            found.append(f"the {axis} is clipped at {value:.2f} {unit} ({ends.max()} samples): set a larger range")
+        elif clipped > LEAST_TIME and clipped >= stuck:
+            value = float(quality["clipped_value"][i])
+            found.append(f"the {axis} is clipped at {value:.2f} {unit} ({clipped:.1f} s in all): set a larger range")
+        elif stuck > LEAST_STUCK:
+            value = float(quality["stuck_value"][i])
+            found.append(
+                f"the {axis} was stuck at {value:.3f} {unit} for {stuck:.1f} s while the other axes moved: look at the "
+                "sensor and its driver"
+            )
+    return found
+
+
 def sample_complaints(state: np.void) -> list[str]:
     """Return one sentence for each fault of the IMU samples: filled holes, clipped and stuck axes."""
     quality = state["quality"]
@@ -45,15 +75,4 @@ def sample_complaints(state: np.void) -> list[str]:
             f"{repeated + bridged} holes in the IMU data are filled with {how}, {float(quality['hole_time']):.1f} s in "
             "all: samples get lost before the driver; better it leaves the holes as they are"
         )
-    for i, (axis, unit) in enumerate(zip(AXES, UNITS)):
-        clipped, stuck = float(quality["clipped_time"][i]), float(quality["stuck_time"][i])
-        if clipped > LEAST_TIME and clipped >= stuck:
-            value = float(quality["clipped_value"][i])
-            found.append(f"the {axis} is clipped at {value:.2f} {unit} ({clipped:.1f} s in all): set a larger range")
-        elif stuck > 0.0:
-            value = float(quality["stuck_value"][i])
-            found.append(
-                f"the {axis} was stuck at {value:.3f} {unit} for {stuck:.1f} s while the other axes moved: look at the "
-                "sensor and its driver"
-            )
-    return found
+    return found + axis_complaints(state)

@@ -77,6 +77,8 @@ def quality_of(state, status, settings):
     settle_time, coast_time = settings.quality_settle_time * 1e9, settings.quality_coast_time * 1e9
     if state.recovery.reset_stamp != NEVER and state.stamp - state.recovery.reset_stamp < settle_time:
         return Quality.SETTLING
+    if state.trust.doubt_stamp != NEVER and state.stamp - state.trust.doubt_stamp < settle_time:
+        return Quality.IMU_CONTRADICTED
     if status == Status.COASTING and state.stamp - state.recovery.absolute_stamp > coast_time:
         return Quality.COASTED_TOO_LONG
     variance = 0.0

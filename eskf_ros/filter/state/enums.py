@@ -35,6 +35,7 @@ class Quality(IntEnum):
     COASTED_TOO_LONG = 6
     TOO_UNCERTAIN = 7
     FAULT = 8
+    IMU_CONTRADICTED = 9
 
 
 IS_USABLE = (Quality.GOOD, Quality.COASTING)
@@ -49,6 +50,8 @@ QUALITY_REASONS = {
     Quality.SETTLING: "the position was reset to the fixes less than quality.settle_time ago",
     Quality.COASTED_TOO_LONG: "no position has been accepted for longer than quality.coast_time",
     Quality.TOO_UNCERTAIN: "the horizontal standard deviation is above quality.position_std",
+    Quality.IMU_CONTRADICTED: "the receivers contradicted the IMU, and a lane that believes it less took over, less "
+    "than quality.settle_time ago",
     Quality.FAULT: "the estimate is broken: call the service ~/reset",
 }
 """What each quality means."""

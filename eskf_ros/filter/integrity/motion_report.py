@@ -1,0 +1,178 @@
+"""What the motion monitor has found, one sentence each with what to do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from eskf_ros.filter.state.enums import Stream
+from eskf_ros.filter.state.time import SECOND
+
+FEWEST_TURNS = 15
+"""Windows with a course from which on turns are compared."""
+
+TURNED = 0.4
+"""rad2; sum of the squares of the changes of course from which on they are."""
+
+LONGEST_COMPARISON = 180 * SECOND
+"""ns; after this time without turns or accelerations nothing is waited for."""
+
+SAME, OTHER = 0.7, 0.3
+"""Correlation of changes of course with a gyro from which on it shows them, and below which it does not."""
+
+NOTABLE_LAG = 0.6
+"""s; a time between course and gyro from which on it is told: less is found by the installation monitor."""
+
+FEWEST_PUSHES = 30
+"""Windows with an acceleration from which on those are compared."""
+
+PUSHED = 0.2
+"""m2/s4; mean square of the accelerations along each axis from which on they are."""
+
+MISSED = 0.5
+"""Share of the specific force that may stay unexplained by accelerations where axes are judged by it."""
+
+MIRRORED = -0.5
+"""Determinant of a comparison, as a share of that of a rotation, below which axes are mirrored."""
+
+NOTABLE_YAW, YAW_SIGMAS = math.radians(3.0), 3.5
+"""rad and standard deviations from which on a direction of travel is told."""
+
+FEWEST_WAYS = 8
+"""Windows from which on the ways by positions and by velocities are compared."""
+
+OTHER_WAY = 20.0
+"""m2; mean square of their difference from which on the axes of the velocities are asked for."""
+
+BETTER = 10.0
+"""Ratio of the squares by which exchanged axes must fit better."""
+
+
+def motion_complaints(state: np.void) -> list[str]:
+    """Return one sentence for each fault of axes and clocks that receiver and IMU show without the filter."""
+    motion = state["motion"]
+    found = []
+    if motion["clock_steps"]:
+        found.append(
+            f"the clock was set forward by {float(motion['clock_step']):.1f} s about the stamp "
+            f"{int(motion['clock_stamp']) * 1e-9:.1f} ({int(motion['clock_steps'])} times): the stamps of IMU and "
+            "fixes went ahead, and the robot did not; let the clock be slewed, or set it before the drive"
+        )
+    own, exchanged, ways = (float(value) for value in motion["axes"])
+    if ways > FEWEST_WAYS and own > OTHER_WAY * ways and own > BETTER * exchanged:
+        # With such velocities the course says nothing of the IMU.
+        return [
+            *found,
+            "the velocities of the receiver fit its positions with east and north exchanged: they seem to be in "
+            "North-East-Down axes; publish East-North-Up (REP-103)",
+        ]
+    return found + _turn_complaints(motion["turns"]) + _push_complaints(motion["pushes"])
+
+
+def has_compared(state: np.void) -> bool:
+    """Say whether the axes of the IMU have been compared with the motion, or would have been by now."""
+    turns = state["motion"]["turns"]
+    has_turned = turns["count"] >= FEWEST_TURNS and turns["course_square"] * turns["count"] > TURNED * turns["weight"]
+    has_pushed = state["motion"]["pushes"]["count"] >= FEWEST_PUSHES
+    return bool(has_turned and has_pushed) or int(state["stamp"]) - int(state["first_stamp"]) > LONGEST_COMPARISON
+
+
+def _turn_complaints(turns: np.void) -> list[str]:
+    """Compare changes of course with the gyros."""
+    weight = max(float(turns["weight"]), 1e-9)
+    mean = float(turns["course"]) / weight
+    square = float(turns["course_square"]) / weight - mean * mean
+    if turns["count"] < FEWEST_TURNS or square * turns["count"] < TURNED:
+        return []
+    of_gyro = turns["gyro"] / weight
+    squares = turns["gyro_square"] / weight - of_gyro * of_gyro
+    products = turns["product"] / weight - of_gyro * mean
+    shown = products / np.sqrt(np.maximum(squares * square, 1e-18))
+    lag = _lag(turns)
+    if (
+        abs(lag) > NOTABLE_LAG
+        and max(shown[2], np.max(turns["shifted"]) / weight / math.sqrt(squares[2] * square)) > SAME
+    ):
+        return [
+            f"by their turns the receiver is stamped about {abs(lag):.1f} s {'later' if lag > 0.0 else 'earlier'} than "
+            "the IMU: the clocks are apart; synchronise the clocks, or set the time_offset of the receiver"
+        ]
+    if shown[2] < -SAME:
+        return [
+            "about the vertical of base_link the gyro turns the other way than the course: axes of the IMU are negated "
+            "or swapped, or imu.mount_rpy_deg is wrong"
+        ]
+    best = int(np.argmax(np.abs(shown)))
+    if abs(shown[2]) < OTHER and abs(shown[best]) > SAME:
+        return [
+            f"the gyro about {'xyz'[best]} of base_link shows the turns of the course, that about z does not: axes of "
+            "the IMU are swapped, or imu.mount_rpy_deg is wrong"
+        ]
+    return []
+
+
+def _lag(turns: np.void) -> float:
+    """Return by how much (s) the course is stamped later than the gyro: the top of the parabola through the products.
+
+    The products of the course with the gyro of the same window, the one before and the one after.
+    """
+    before, after = (float(value) for value in turns["shifted"])
+    same = float(turns["product"][2])
+    bend = before - 2.0 * same + after
+    if same + before + after <= 0.0 or bend >= 0.0:
+        return 0.0
+    return 0.5 * (after - before) / bend * float(turns["length"])
+
+
+def _compared(pushes: np.void) -> tuple[np.ndarray, float] | None:
+    """Return the matrix (2, 2) from acceleration to specific force, and the standard deviation (rad) of its angle.
+
+    None without enough accelerations, or where they do not explain the force.
+    """
+    count = float(pushes["count"])
+    square = pushes["acceleration_square"]
+    if count < FEWEST_PUSHES or np.linalg.eigvalsh(square)[0] < PUSHED * count:
+        return None
+    matrix: np.ndarray = np.linalg.solve(square, pushes["product"].T).T
+    explained = float(np.trace(matrix @ square @ matrix.T))
+    missed = float(pushes["force_square"]) - explained
+    if missed > MISSED * float(pushes["force_square"]):
+        return None
+    return matrix, math.sqrt(max(missed, 0.0) / (explained * count))
+
+
+def _push_complaints(pushes: np.void) -> list[str]:
+    """Compare accelerations along the course and to its left with the specific force."""
+    compared = _compared(pushes)
+    if compared is None:
+        return []
+    matrix, _ = compared
+    if np.linalg.det(matrix) > 0.5 * MIRRORED * float(np.sum(matrix * matrix)):
+        return []
+    return [
+        "accelerations along the course and to its left appear mirrored in x and y of base_link: axes of the "
+        "accelerometer are swapped or negated"
+    ]
+
+
+def travel_complaints(state: np.void, settings: np.void, mount_rpy_deg: Sequence[float]) -> tuple[list[str], bool]:
+    """Return a sentence if the robot does not travel along x of base_link, and whether it is told to do so.
+
+    Only a robot that is made to travel along x is mounted wrong then.
+    """
+    compared = _compared(state["motion"]["pushes"])
+    if compared is None or motion_complaints(state):
+        return [], False
+    matrix, std = compared
+    yaw = -math.atan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1])
+    if abs(yaw) < max(NOTABLE_YAW, YAW_SIGMAS * std):
+        return [], False
+    roll, pitch, told = mount_rpy_deg
+    wanted = (told + math.degrees(yaw) + 180.0) % 360.0 - 180.0
+    text = (
+        f"by its accelerations the robot travels at {-math.degrees(yaw):+.1f} deg (+- {math.degrees(std):.1f}) to x of "
+        f"base_link: if it is made to travel along x, set imu.mount_rpy_deg to [{roll:g}, {pitch:g}, {wanted:.1f}]"
+    )
+    return [text], bool(settings["use_course"]) or bool(settings["constrains"][Stream.NHC])

@@ -1,0 +1,119 @@
+"""Sums that compare the motion by a receiver with that by the IMU: see `motion_monitor`."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from eskf_ros.compiled import njit
+from eskf_ros.geodesy.rotation import wrapped
+
+TURNS = np.dtype(
+    [
+        ("count", "f8"),
+        ("weight", "f8"),
+        ("course", "f8"),
+        ("course_square", "f8"),
+        ("gyro", "f8", (3,)),
+        ("gyro_square", "f8", (3,)),
+        ("product", "f8", (3,)),
+        ("shifted", "f8", (2,)),
+        ("last", "f8", (2,)),
+        ("last_stamp", "i8"),
+        ("length", "f8"),
+    ],
+    align=True,
+)
+"""Sums over windows of the change of course and the integrated rates (rad, axes of base_link), weighted (1/rad2).
+
+``shifted``: products of the course with the rate about z of the window before, and of the rate with the course of the
+window before, which ``last``, ``last_stamp`` keep. ``length``: of the last window (s).
+"""
+
+PUSHES = np.dtype(
+    [
+        ("count", "f8"),
+        ("mean_acceleration", "f8", (2,)),
+        ("mean_force", "f8", (2,)),
+        ("acceleration_square", "f8", (2, 2)),
+        ("force_square", "f8"),
+        ("product", "f8", (2, 2)),
+    ],
+    align=True,
+)
+"""Sums over windows of acceleration along the course and to its left, and specific force (m/s2, x and y of base_link).
+
+Both without their running means: tilts and biases change slowly. ``product``: row force, column acceleration.
+"""
+
+MEMORY = 600.0
+"""Windows that the sums remember, about."""
+
+SLOW = 3.0
+"""m/s; at less the course says little."""
+
+MEAN_MEMORY = 20.0
+"""Windows over which the running means are taken."""
+
+COURSE_ERROR = 0.01
+"""rad; by which the course differs from the heading beside all noise."""
+
+LARGEST_TURN = 1.5
+"""rad; within a window course and gyro only turn by more where the robot changes its direction of travel."""
+
+
+@njit
+def add_turn(turns, before, after, turn, variance, start, passed):
+    """Add the change of course from one velocity to the next, of a ``variance`` (rad2), and the integrated rates.
+
+    ``start``, ``passed``: when the window began (ns), and its length (s).
+    """
+    course = wrapped(math.atan2(after[1], after[0]) - math.atan2(before[1], before[0]))
+    if max(abs(course), max(abs(turn[0]), max(abs(turn[1]), abs(turn[2])))) > LARGEST_TURN:
+        return
+    weight, remains = 1.0 / (variance + COURSE_ERROR**2), 1.0 - 1.0 / MEMORY
+    turns.count = remains * turns.count + 1.0
+    turns.weight = remains * turns.weight + weight
+    turns.course = remains * turns.course + weight * course
+    turns.course_square = remains * turns.course_square + weight * course * course
+    turns.shifted[0] *= remains
+    turns.shifted[1] *= remains
+    if start == turns.last_stamp:
+        turns.shifted[0] += weight * course * turns.last[0]
+        turns.shifted[1] += weight * turn[2] * turns.last[1]
+    turns.last[0], turns.last[1] = turn[2], course
+    turns.last_stamp = start + round(passed * 1e9)
+    turns.length = passed
+    for i in range(3):
+        turns.gyro[i] = remains * turns.gyro[i] + weight * turn[i]
+        turns.gyro_square[i] = remains * turns.gyro_square[i] + weight * turn[i] * turn[i]
+        turns.product[i] = remains * turns.product[i] + weight * turn[i] * course
+
+
+@njit
+def add_push(pushes, before, after, push, time):
+    """Add the mean acceleration over ``time`` (s) from one velocity to the next, and the integrated specific force."""
+    east, north = before[0] + after[0], before[1] + after[1]
+    length = math.hypot(east, north)
+    if length < SLOW:
+        return
+    east, north = east / length, north / length
+    change = ((after[0] - before[0]) / time, (after[1] - before[1]) / time)
+    acceleration = (change[0] * east + change[1] * north, change[1] * east - change[0] * north)
+    share = 1.0 / min(pushes.count + 1.0, MEAN_MEMORY)
+    remains = 1.0 - 1.0 / MEMORY
+    pushes.count = remains * pushes.count + 1.0
+    pushes.force_square *= remains
+    for i in range(2):
+        pushes.mean_acceleration[i] += share * (acceleration[i] - pushes.mean_acceleration[i])
+        pushes.mean_force[i] += share * (push[i] / time - pushes.mean_force[i])
+    for i in range(2):
+        force = push[i] / time - pushes.mean_force[i]
+        pushes.force_square += force * force
+        for j in range(2):
+            of_course = acceleration[j] - pushes.mean_acceleration[j]
+            pushes.product[i, j] = remains * pushes.product[i, j] + force * of_course
+            pushes.acceleration_square[i, j] = (
+                remains * pushes.acceleration_square[i, j] + (acceleration[i] - pushes.mean_acceleration[i]) * of_course
+            )
