@@ -12,6 +12,7 @@ from eskf_ros.compiled import njit
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import VELOCITY
 from eskf_ros.filter.state.streams import is_live
+from eskf_ros.filter.state.time import NEVER
 
 JUMP_GATE = 30.7
 """NIS of 3 scalars in the humble lane beyond which a message jumps: the chi-square quantile of 1 - 1e-6."""
@@ -132,7 +133,9 @@ def note_jump(state, aid, kind, work):
     trust.jump[kind, source] = max(trust.jump[kind, source], math.sqrt(square))
     lasted = aid.stamp - trust.refused_since[kind, source]
     is_alone = not is_live(state, other_stream(aid.stream), source)
-    is_apart = (is_alone and stays > AGREEMENT_GATE) or (kind == 1 and grows > AGREEMENT_GATE)
+    # A heading that was given and that no motion has confirmed is more likely wrong than velocities.
+    is_turned = kind == 1 and grows > AGREEMENT_GATE and state.heading.given_stamp != NEVER
+    is_apart = (is_alone and stays > AGREEMENT_GATE) or is_turned
     is_apart = is_apart or is_other_refused(state, aid.stream, source) or state.heading_known == 0
     patience = SHORT_PATIENCE if is_apart else patience_for(state, aid.stream, source)
     if trust.refused[kind, source] < FEWEST or lasted < patience:
