@@ -38,13 +38,12 @@ WITHOUT_VELOCITY = "gnss.use_velocity: false"
 
 
 class Row(NamedTuple):
-    """Largest errors (m) inside outages by filter and smoother, 50 % and 95 %; their number, breaks and resets."""
+    """Largest errors (m) inside outages by filter and smoother, 50 % and 95 %; their number, breaks of the smoother."""
 
     filter: tuple[float, float]
     smoother: tuple[float, float]
     count: int
     breaks: int
-    resets: int
 
 
 def smoothed_summary(recording: Recording, *lines: str, outages: Outages = ()) -> dict[str, Any]:
@@ -64,20 +63,19 @@ def inside_outages(recording: Recording, sets: tuple[Outages, ...], *lines: str)
 def inside_outages_of(recordings: list[tuple[Recording, tuple[Outages, ...]]], *lines: str) -> Row:
     """Replay each recording with each of its sets of outages; largest horizontal errors inside all of them."""
     errors: dict[str, list[float]] = {"filter": [], "smoother": []}
-    breaks = resets = 0
+    breaks = 0
     for recording, outages in [(recording, outages) for recording, sets in recordings for outages in sets]:
         summary = smoothed_summary(recording, *lines, outages=outages)
         breaks += summary["smoothed"]["breaks"]
-        resets += summary["smoothed"]["resets"]
         for name, found in (("filter", summary), ("smoother", summary["smoothed"])):
             errors[name] += [o["horizontal_max"] for o in found["outages"] if o["horizontal_max"] is not None]
     half_and_most = [tuple(np.percentile(errors[name], [50.0, 95.0]).tolist()) for name in ("filter", "smoother")]
-    return Row(*half_and_most, len(errors["smoother"]), breaks, resets)
+    return Row(*half_and_most, len(errors["smoother"]), breaks)
 
 
 def main() -> int:
     """Replay all drives and write the table."""
-    lines = ["| drive | outages | filter | smoother | breaks, resets | bar |", "|---|---|---|---|---|---|"]
+    lines = ["| drive | outages | filter | smoother | breaks | bar |", "|---|---|---|---|---|---|"]
     passed = True
     with tempfile.TemporaryDirectory() as folder:
         rural = drive_0708_recording(Path(folder), find_data_folder("drive_0708"), False)
@@ -108,7 +106,7 @@ def main() -> int:
             passed &= good
             lines.append(
                 f"| {label} | {row.count} of {sets[0][0][1]:g} s | {row.filter[0]:.2f}, {row.filter[1]:.2f} m "
-                f"| {row.smoother[0]:.2f}, {row.smoother[1]:.2f} m | {row.breaks}, {row.resets} "
+                f"| {row.smoother[0]:.2f}, {row.smoother[1]:.2f} m | {row.breaks} "
                 f"| {bar[0]}, {bar[1]}: {'pass' if good else 'MISSED'} |"
             )
             print(lines[-1], flush=True)
@@ -120,7 +118,7 @@ def main() -> int:
             row = inside_outages_of(ontario, *changes)
             lines.append(
                 f"| {label} | {row.count} of 30 s | {row.filter[0]:.2f}, {row.filter[1]:.2f} m "
-                f"| {row.smoother[0]:.2f}, {row.smoother[1]:.2f} m | {row.breaks}, {row.resets} | none |"
+                f"| {row.smoother[0]:.2f}, {row.smoother[1]:.2f} m | {row.breaks} | none |"
             )
             print(lines[-1], flush=True)
         for with_velocity in (False, True):
@@ -130,7 +128,7 @@ def main() -> int:
             passed &= smoothed <= 0.5 * by_filter
             lines.append(
                 f"| KITTI, {fixes} every 10 s, rms of all | | {by_filter:.2f} m "
-                f"| {smoothed:.2f} m | {summary['smoothed']['breaks']}, {summary['smoothed']['resets']} "
+                f"| {smoothed:.2f} m | {summary['smoothed']['breaks']} "
                 f"| half: {'pass' if smoothed <= 0.5 * by_filter else 'MISSED'} |"
             )
             print(lines[-1], flush=True)

@@ -147,8 +147,8 @@ class Result:
 class Smoothed:
     """The smoothed trajectory; ``trajectory``, ``biases`` and ``odometry`` as in `Result`, where the position is known.
 
-    ``breaks``: starts of the filter, over which nothing is smoothed. Status and quality are those of the filter; there
-    is no pose in odom.
+    ``breaks``: starts, resets and takeovers of the filter, over which nothing is smoothed. Status and quality are those
+    of the filter; there is no pose in odom.
     """
 
     trajectory: Any

@@ -55,7 +55,6 @@ class Smoothing:
         return {
             "nodes": self._smoother.node_count,
             "breaks": self._smoother.breaks,
-            "resets": self._smoother.resets,
             **({} if compared is None else accuracy(compared)),
             "outages": [] if compared is None else summary.outage_errors(compared),
         }

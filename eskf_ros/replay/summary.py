@@ -18,8 +18,8 @@ Stamps are integer ns, lengths m, times s; an unknown value is null.
 - `error`: absolute errors at the truth epochs from the first known position on, heading from the first known heading
   on; of the antenna if the truth is a NavSatFix. `nees`: e' P^-1 e, 3 degrees of freedom, so its ideal mean is 3.
 - `smoothed` (with --smooth): the same `error`, `nees` and errors in `outages[]` of the smoothed trajectory; `nodes`:
-  stamps at which measurements changed the estimate; `breaks`: starts of the filter, over which nothing is smoothed;
-  `resets`: resets and takeovers, over which only position and velocity are carried back.
+  stamps at which measurements changed the estimate; `breaks`: starts, resets and takeovers of the filter, over which
+  nothing is smoothed.
 - `ranges`: `epochs` read and epochs `withheld`, `signals` by `gnss.ranges.Status`, `clock_jumps_ms`: milliseconds by
   which the receiver clock jumped, `outvoted_states`: how often most satellites contradicted the state, whose variance
   was then inflated.

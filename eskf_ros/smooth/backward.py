@@ -10,13 +10,9 @@ transition F of the errors between nodes, and smoothed x_s, P_s (Sarkka, Bayesia
 The differences count from the predicted state: what the filter injected at the node is part of them. Its reset turns
 the axes of the attitude error; the log has the matrix G of it, and the smoothed errors go back by its inverse. So the
 pass is linear in errors about the trajectory of the filter, whatever force the filter believed and however it resets.
-
-Where the alignment began anew the smoothed state is the filter's own and the recursion begins anew. Where the filter
-was reset, or the humble lane took over, the filter was wrong and cannot have known by how much: of what comes from the
-future only position and velocity pass (`carry_motion`), which measurements have shown. All else follows from these
-with the covariance that the filter had: in an outage its drift is bent onto the position at the end, while a bias that
-the lane has found says nothing of that before. An augmented state that was reset tells nothing of its past: it is left
-out of P- there.
+Where the filter did something else than to predict and to update (`output.forward_log`), the smoothed state is the
+filter's own and the recursion begins anew. An augmented state that was reset tells nothing of its past: it is left out
+of P- there.
 """
 
 from __future__ import annotations
@@ -78,7 +74,6 @@ PASS = np.dtype(
         # Of the node itself.
         ("covariance", "f8", (ERROR_CAPACITY, ERROR_CAPACITY)),
         ("change", "f8", (ERROR_CAPACITY,)),
-        ("smoothed", "f8", (ERROR_SIZE + CORE_TRIANGLE,)),
         # Intermediate results.
         ("scale", "f8", (ERROR_CAPACITY,)),
         ("factor", "f8", (ERROR_CAPACITY, ERROR_CAPACITY)),
@@ -107,19 +102,14 @@ def smooth_nodes(nodes, numbers, pass_, clock_at):
         if p.is_linked == 1:
             compute_gain(p, size, clock_at)
             apply_gain(p, size)
-        at = 0
-        for i in range(ERROR_SIZE):
-            p.smoothed[i] = p.change[i]
-            for j in range(i + 1):
-                p.smoothed[ERROR_SIZE + at] = p.covariance[i, j]
-                at += 1
         go_before(p, node, row)
+        for i in range(ERROR_SIZE):
+            row[CORRECTION_AFTER + i] = p.change[i]
+            row[CORRECTION_BEFORE + i] = p.correction[i]
         at = 0
         for i in range(ERROR_SIZE):
-            row[CORRECTION_AFTER + i] = p.smoothed[i]
-            row[CORRECTION_BEFORE + i] = p.correction[i]
             for j in range(i + 1):
-                row[SMOOTHED_AFTER + at] = p.smoothed[ERROR_SIZE + at]
+                row[SMOOTHED_AFTER + at] = p.covariance[i, j]
                 row[SMOOTHED_BEFORE + at] = p.predicted[i, j] + p.added[i, j]
                 at += 1
 
@@ -137,8 +127,8 @@ def unpack(row, place, size, matrix):
 
 @njit
 def compute_gain(p, size, clock_at):
-    """Write C' = P-(k+1)^-1 F P+(k) to ``p.gain``."""
-    gain, covariance = p.gain, p.covariance
+    """Write C' = P-(k+1)^-1 F P+(k) to ``p.gain``, by the Cholesky factor of the correlation matrix of P-(k+1)."""
+    gain, covariance, factor, scale = p.gain, p.covariance, p.factor, p.scale
     for i in range(ACCEL_BIAS):
         for j in range(size):
             gain[i, j] = 0.0
@@ -154,16 +144,6 @@ def compute_gain(p, size, clock_at):
     if clock_at + 1 < size:
         for j in range(size):
             gain[clock_at, j] += p.fade[OPTIONAL_CAPACITY] * covariance[clock_at + 1, j]
-    solve_predicted(p, size)
-
-
-@njit
-def solve_predicted(p, size):
-    """Replace ``p.gain`` by the inverse of ``p.predicted`` times it, by the Cholesky factor of the correlation matrix.
-
-    An error whose variance there is 0 is left out.
-    """
-    gain, factor, scale = p.gain, p.factor, p.scale
     for i in range(size):
         variance = p.predicted[i, i]
         scale[i] = 1.0 / math.sqrt(variance) if variance > 0.0 else 0.0
@@ -284,31 +264,3 @@ def go_before(p, node, row):
             for j in range(size):
                 p.added[i, j], p.added[j, i] = 0.0, 0.0
                 p.predicted[i, j], p.predicted[j, i] = 0.0, 0.0
-    if node.is_replaced == 1:
-        carry_motion(p, node, row)
-
-
-@njit
-def carry_motion(p, node, row):
-    """Keep of what is said of the estimate before a node only what it says of position and velocity.
-
-    What the filter thought of all else follows from these with the covariance that it had (the smoothed state is the
-    filter's, given position and velocity): C with the identity for F, and with all other errors left out of P-.
-    """
-    size = node.size_before
-    for i in range(size):
-        p.change[i] = 0.0
-        for j in range(size):
-            p.covariance[i, j] = p.predicted[i, j]
-            p.gain[i, j] = p.predicted[i, j]
-            if i >= ATTITUDE or j >= ATTITUDE:
-                p.predicted[i, j], p.added[i, j] = 0.0, 0.0
-        if i >= ATTITUDE:
-            p.correction[i] = 0.0
-    solve_predicted(p, size)
-    apply_gain(p, size)
-    unpack(row, COVARIANCE_BEFORE, size, p.predicted)
-    for i in range(size):
-        p.correction[i] = p.change[i]
-        for j in range(size):
-            p.added[i, j] = p.covariance[i, j] - p.predicted[i, j]

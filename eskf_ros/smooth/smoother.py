@@ -39,9 +39,7 @@ class Smoother:
         self._stamps: list[NDArray[np.int64]] = []
         self._is_smoothed = False
         self.breaks = 0
-        """Starts of the filter, over which nothing is smoothed."""
-        self.resets = 0
-        """Stamps with resets and takeovers of the filter, over which only position and velocity are carried back."""
+        """Starts, resets and takeovers of the filter, over which nothing is smoothed."""
 
     @property
     def node_count(self) -> int:
@@ -82,7 +80,6 @@ class Smoother:
             smooth_nodes(nodes, numbers, carried, int(settings["clock_at"][0]))
             self._numbers.replace(first, numbers)
             self.breaks += int(np.count_nonzero((nodes["is_linked"] == 1) & (nodes["is_continued"] == 0)))
-            self.resets += int(np.count_nonzero((nodes["is_continued"] == 1) & (nodes["is_replaced"] == 1)))
 
     def rows(self) -> Iterator[NDArray[Any]]:
         """Yield the smoothed ODOMETRY rows in blocks, at the output stamps; pose in odom and its variances are zero."""

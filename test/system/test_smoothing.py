@@ -177,12 +177,14 @@ def test_a_fixed_lag_gives_most_of_it() -> None:
     assert squares.mean() < 6.0
 
 
+FALSE_SHOCK = pytest.mark.xfail(
+    reason="0.66 m: vibration at 41.8 s passes for a shock and widens the attitude of the filter; 0.59 m without"
+)
+
+
 @pytest.mark.parametrize(
     ("lines", "half", "most"),
-    [
-        pytest.param((), 0.28, 0.62, marks=pytest.mark.xfail(reason="0.657 m at 95 %", strict=False)),
-        ((NHC,), 0.23, 0.48),
-    ],
+    [pytest.param((), 0.28, 0.62, marks=FALSE_SHOCK), ((NHC,), 0.23, 0.48)],
     ids=["positions", "nhc"],
 )
 def test_drive_0708_inside_outages(
@@ -196,19 +198,26 @@ def test_drive_0708_inside_outages(
     assert row.smoother[1] <= most
 
 
+THREE_OUTAGES = pytest.mark.xfail(reason="0.90 m, by the outages from 510, 810 and 1500 s; the cause is open")
+
+TOKYO_NHC = (NHC, *REAR_AXLE)
+
+
 @pytest.mark.parametrize(
     ("lines", "half", "most"),
     [
+        ((WITHOUT_VELOCITY,), 0.34, 2.6),
+        pytest.param((WITHOUT_VELOCITY, *TOKYO_NHC), 0.25, 0.78, marks=THREE_OUTAGES),
         ((), 0.34, 2.6),
-        pytest.param((NHC, *REAR_AXLE), 0.25, 0.78, marks=pytest.mark.xfail(reason="0.914 m at 95 %", strict=False)),
+        (TOKYO_NHC, 0.25, 0.78),
     ],
-    ids=["positions", "nhc"],
+    ids=["positions", "positions-nhc", "velocities", "velocities-nhc"],
 )
 def test_tsukishima_inside_outages(
     tmp_path: Path, data_folder: Callable[[str], Path], lines: tuple[str, ...], half: float, most: float
 ) -> None:
     recording = tsukishima_recording(tmp_path, data_folder("tsukishima_20201105"))
-    row = inside_outages(recording, TOKYO_OUTAGES, WITHOUT_WHEELS, WITHOUT_VELOCITY, *lines)
+    row = inside_outages(recording, TOKYO_OUTAGES, WITHOUT_WHEELS, *lines)
     assert row.count == 43
     assert row.smoother[0] <= half
     assert row.smoother[1] <= most

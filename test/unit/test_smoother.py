@@ -214,28 +214,6 @@ def test_nothing_passes_a_break() -> None:
         np.testing.assert_array_equal(case.numbers[5:, part], alone.numbers[5:, part])
 
 
-def test_a_takeover_hands_on_position_and_velocity_alone() -> None:
-    """Before it the estimate is that of the filter, given the smoothed position and velocity; no bias passes."""
-    case = LinearCase(2)
-    replaced = case.nodes[5]
-    replaced["is_replaced"] = 1
-    size, numbers = int(replaced["size_before"]), case.numbers[5]
-    p = matrix_of(numbers, COVARIANCE_BEFORE, size)[:ERROR_SIZE, :ERROR_SIZE]
-    before = nominal_of(numbers, BEFORE)[:6].copy()
-    smooth_nodes(case.nodes, case.numbers, allocate(PASS), CLOCK)
-    found = case.after[5][:6] + numbers[CORRECTION_AFTER : CORRECTION_AFTER + 6]
-    motion = matrix_of(numbers, SMOOTHED_AFTER, ERROR_SIZE)[:6, :6]
-    gain = np.linalg.solve(p[:6, :6], p[:6]).T
-    sigma = np.sqrt(np.diag(p))
-    correction = numbers[CORRECTION_BEFORE : CORRECTION_BEFORE + ERROR_SIZE]
-    np.testing.assert_allclose(correction / sigma, gain @ (found - before) / sigma, atol=1e-9)
-    expected = (p + gain @ (motion - p[:6, :6]) @ gain.T) / sigma / sigma[:, None]
-    spread = matrix_of(numbers, SMOOTHED_BEFORE, ERROR_SIZE) / sigma / sigma[:, None]
-    np.testing.assert_allclose(spread, expected, atol=1e-9)
-    assert np.linalg.eigvalsh(spread).min() > 0.0
-    assert case.numbers[4, CORRECTION_AFTER : CORRECTION_AFTER + ERROR_SIZE].any()
-
-
 def logged(recording: Recording, changes: dict[str, Any], messages: Any = None) -> tuple[Navigator, Smoother]:
     """Filter and smoother after all of a recording but the end, the log collected every second."""
     navigator = Navigator(

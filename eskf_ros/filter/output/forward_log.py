@@ -6,10 +6,9 @@ by which resets turned the attitude error in between, and the transition matrix 
 point is the nominal state at an output stamp, before the measurements of that stamp. Where the log stands is part of
 the state, so a rewind takes back what it makes wrong.
 
-A smoother must not carry over a change what the transition does not describe. A node is linked to the one before if the
-estimate was only predicted in between, and continued if its measurements began nothing anew (`breaks_of`). It is
-replaced if they reset the estimate, or the humble lane took over (`replacements_of`). Augmented states that were reset
-are listed one by one (``renewed``).
+A smoother must not carry anything over a change that the transition does not describe. A node is linked to the one
+before if the estimate was only predicted in between, and continued if its measurements only updated it: no start, no
+reset, no takeover (`breaks_of`). Augmented states that were reset are listed one by one (``renewed``).
 """
 
 from __future__ import annotations
@@ -37,7 +36,6 @@ FORWARD = np.dtype(
         ("breaks", "i8"),
         ("given_stamp", "i8"),
         ("breaks_before", "i8"),
-        ("replacements_before", "i8"),
         ("given_before", "i8"),
         ("is_open", "i8"),
         ("renewed", "i8"),
@@ -52,8 +50,7 @@ FORWARD = np.dtype(
 
 - ``node_next``, ``point_next``: index of the next node and point in the buffers.
 - ``node_stamp``, ``breaks``, ``given_stamp``: of the last node: stamp (ns), and what must be the same for a link.
-- ``is_open``, ``breaks_before``, ``given_before``, ``replacements_before``: whether a node waits for its end; the same
-  before its measurements.
+- ``is_open``, ``breaks_before``, ``given_before``: whether a node waits for its end; the same before its measurements.
 - ``renewed``: augmented states that were reset, as bits.
 - ``reset``: product of the matrices by which updates turned the attitude error (`kalman_update.reset_attitude_error`).
 - ``transition``: of the core; ``fade``: of each augmented state; ``clock_gain``: drift to bias of the clock (s).
@@ -68,7 +65,6 @@ NODE = np.dtype(
         ("has_after", "i8"),
         ("is_linked", "i8"),
         ("is_continued", "i8"),
-        ("is_replaced", "i8"),
         ("renewed", "i8"),
     ],
     align=True,
@@ -154,16 +150,10 @@ def take_log(
 
 @njit
 def breaks_of(state):
-    """Return a number that changes with every start of the alignment; -1 while something is not known."""
+    """Return a number that changes with every start, reset and takeover; -1 while something is not known."""
     if state.level_known == 0 or state.position_known == 0 or state.heading_known == 0:
         return -1
-    return state.restarts
-
-
-@njit
-def replacements_of(state):
-    """Return a number that changes with every reset, takeover by the humble lane, and inflation by a majority."""
-    return state.recovery.resets + state.trust.takeovers + state.tight.range_faults
+    return state.restarts + state.recovery.resets + state.trust.takeovers + state.tight.range_faults
 
 
 @njit
@@ -212,7 +202,6 @@ def open_node(state, log):
     k = forward.node_next
     node = log.nodes[k]
     forward.breaks_before, forward.given_before = breaks_of(state), state.heading.given_stamp
-    forward.replacements_before = replacements_of(state)
     same = forward.breaks_before == forward.breaks and forward.given_before == forward.given_stamp
     node.stamp = state.stamp
     node.size_before = state.error_size
@@ -247,7 +236,6 @@ def close_node(state, log, is_kept, settings):
     breaks, given = breaks_of(state), state.heading.given_stamp
     same = breaks == forward.breaks_before and given == forward.given_before
     node.is_continued = 1 if same and breaks >= 0 else 0
-    node.is_replaced = 0 if replacements_of(state) == forward.replacements_before else 1
     node.size_after = state.error_size
     node.renewed = forward.renewed
     for i in range(3):
