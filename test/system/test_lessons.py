@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from eskf_ros.replay.main import _parser as replay_parser
+from eskf_ros.replay.arguments import parser as replay_parser
 from eskf_ros.simulate.main import _options as simulate_options
 from eskf_ros.simulate.main import _parser as simulate_parser
 from eskf_ros.simulate.scenarios import scenario
