@@ -126,6 +126,17 @@ def longest_runs(is_so: NDArray[np.bool_]) -> tuple[int, int, int]:
     return int(lengths[longest]), int(edges[2 * longest]), int(lengths.sum())
 
 
+def is_limit(column: Array, value: float) -> bool:
+    """Whether a value at which an axis (n,) stays is its limit: an extreme, or a size at which it stays repeatedly.
+
+    A sensor whose range was set smaller in mid-drive has read more before.
+    """
+    if value in (column.min(), column.max()):
+        return True
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], np.abs(column) == abs(value), [False]]).astype(np.int8)))
+    return int(np.count_nonzero(edges[1::2] - edges[::2] >= CLIPPED)) > 1
+
+
 def _repetition_findings(samples: Sensor, interval: float) -> list[Finding]:
     found = []
     values, begin = samples.values, samples.stamp[0]
@@ -142,8 +153,7 @@ def _repetition_findings(samples: Sensor, interval: float) -> list[Finding]:
         found.append(Finding(Severity.WARNING, "repeated_samples", samples.topic, text, remedy, evidence))
     for axis in range(6):
         length, start, _ = longest_runs(same[:, axis] & ~whole)
-        at_limit = values[start, axis] in (values[:, axis].min(), values[:, axis].max())  # then it is clipped
-        if length * interval > STUCK and not at_limit:
+        if length * interval > STUCK and not is_limit(values[:, axis], values[start, axis]):
             name = f"{'accelerometer' if axis < 3 else 'gyro'} {AXES[axis % 3]}"
             at = (samples.stamp[start] - begin) * 1e-9
             text = f"the {name} stays at {values[start, axis]:.4g} for {length * interval:.1f} s, from {at:.1f} s on"
@@ -167,7 +177,12 @@ def _clipping_findings(samples: Sensor) -> list[Finding]:
     found = []
     for axis in range(6):
         column = samples.values[:, axis]
-        for limit, side in ((column.max(), "above"), (column.min(), "below")):
+        _, start, _ = longest_runs(np.diff(column) == 0.0)
+        stays = float(column[start])
+        limits = {float(column.max()): "above", float(column.min()): "below"}
+        if is_limit(column, stays):
+            limits.setdefault(stays, "above" if stays > np.median(column) else "below")
+        for limit, side in limits.items():
             at_limit = column == limit
             length, _, count = longest_runs(at_limit)
             spread = np.percentile(column, 75.0) - np.percentile(column, 25.0)

@@ -171,6 +171,8 @@ def watch_position(state, aid, settings):
     if has_velocity:
         extend_way(motion, aid.stamp)
     if motion.fix_stamp != NEVER:
+        # A fix may come within a pause of the IMU, of which no sample has told yet.
+        motion.longest_interval = max(motion.longest_interval, (aid.stamp - state.imu.stamp) * 1e-9)
         watch_step(motion, aid, fix, axes, has_velocity)
     watch_pause(motion, aid, fix, axes, has_velocity)
     passed = (aid.stamp - motion.start_stamp) * 1e-9 if motion.start_stamp != NEVER else math.inf

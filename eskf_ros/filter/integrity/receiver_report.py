@@ -40,6 +40,9 @@ def aid_complaints(state: np.void, settings: np.void, is_explained: bool, is_imu
     """
     found: list[str] = []
     is_certain = has_compared(state) and not is_explained
+    own, exchanged, _ = state["motion"]["axes"]
+    # Velocities that seem to be in other axes contradict all fixes; whether they are takes a while.
+    is_explained = is_explained or own > exchanged
     for source in range(SOURCES):
         if is_explained or state["receiver"]["fix_count"][source] < MANY_FIXES:
             continue
