@@ -37,7 +37,9 @@ time constants from 0.5 to 300 s, with the gyro as it is and with the mean of it
 The left picture is why. The complementary filter takes the accelerometer for a plumb line, and it is one only at rest:
 in a bend of 2 m/s2 it shows atan(2/9.81) = 11.5 deg. With a short time constant it believes this, with a long one it
 drifts by tau times the gyro bias. Between the two is a best one, but it depends on the drive and on the bias, and in a
-long bend it is wrong whatever the constant.
+long bend it is wrong whatever the constant. What is left at {best} s is the level of the start: a bias of the
+accelerometer looks like a tilt, and at rest nobody can tell the two apart. The ESKF begins with the same error, and
+loses it in the first bends (right picture).
 
 The ESKF asks the receiver: what the velocity does over the second is the acceleration, and what is left of the specific
 force is gravity. So a bend is no disturbance but a source of information; it is in bends that the filter learns the

@@ -41,15 +41,15 @@ Horizontal error after the minute, median:
 | 1 | {loose_1} | {tight_1} |
 | 0 | {loose_0} | {tight_0} |
 
-A position has three unknowns, and the clock of the receiver is a fourth: four satellites, or no fix (with more than one
-constellation even five, for the offset between their clocks). Loose coupling falls off this cliff. In tight coupling
+A position has three unknowns, and the clock of the receiver is a fourth: four satellites, or no fix. Loose coupling
+falls off this cliff. In tight coupling
 each range is a measurement of its own, of the position along one line of sight, and each Doppler one of the velocity.
 The filter knows its position and its clock from before, so three satellites correct nearly everything, two about half.
 One mostly feeds the clock: its range says how far the sum of position and clock is off, and a common crystal wanders
 as much as the position does.
 
-With four satellites the two differ although both have a fix: few satellites lie badly, and a fix of theirs can be
-tens of metres off along one direction. Tight coupling does not need to solve for what the satellites do not show.
+With four satellites the two differ although both have a fix: four satellites seldom surround the car, and a fix of
+theirs is poor along one direction. Tight coupling does not need to solve for what the satellites do not show.
 
 ## What to take home
 

@@ -36,7 +36,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Lesson:
-    """One lesson. ``sentence`` (for the index), ``text`` have the figures of the outcome as ``{name}``.
+    """One lesson. ``sentence``, for the index, and ``text`` have the figures of the outcome as ``{name}``.
 
     ``by_hand``: commands that show the same without Python. ``run`` takes the number of simulated recordings where the
     lesson counts on many; ``runs`` is how many the page has.
@@ -54,6 +54,7 @@ class Lesson:
         """Return the page in Markdown."""
         return (
             f"# {self.title}\n\n"
+            f"{self.sentence.format_map(figures)}\n\n"
             f"```sh\n.venv/bin/python examples/lessons {self.name}\n```\n\n"
             f"![{self.title}]({self.name}.png)\n\n"
             f"{self.text.format_map(figures).strip()}\n\n"

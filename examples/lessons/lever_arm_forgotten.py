@@ -36,8 +36,7 @@ it is another heading.
 
 And the innovations? They hardly change: fixes, velocities and a slowly turned state agree with each other. No gate
 closes, and a test on NIS does not ring. An error that turns with the robot is absorbed by states that turn with it.
-The filter notices that its fixes wander against its velocities, and takes the error for a lasting one of the receiver:
-the published sigma grows, but not as far as the error.
+The published sigma, {sigma_wrong} m, comes from a model in which the antenna is where it is said to be.
 
 ## What to take home
 

@@ -37,7 +37,8 @@ that it sees accelerations, and grows sure of a heading that nothing has told.)
 
 In the bend f has 2 m/s2 across the vehicle. With a wrong heading the filter turns it into the wrong direction, after a
 second the velocity is off by more than the receiver's 0.08 m/s, and the correlation in P carries this back to the
-heading. It is found {found} s after the start, without any heading sensor, whichever way the vehicle points.
+heading. It is found {found} s after the start, without any heading sensor, whichever way the vehicle points. On the
+straight that follows both grow again: one bend has shown the heading, but not yet the bias of the gyro.
 
 ## What to take home
 
@@ -88,8 +89,8 @@ def run(runs: int) -> Outcome:
 LESSON = Lesson(
     name="unobservable_heading",
     title="Heading is unobservable until a turn",
-    sentence="On a straight the sigma of the heading stays at {sigma_19} deg for 20 s with perfect fixes; five seconds "
-    "of a bend bring it to {sigma_25} deg.",
+    sentence="On a straight the sigma of the heading stays at {sigma_19} deg for 20 s, however good the fixes; "
+    "five seconds of a bend bring it to {sigma_25} deg.",
     text=TEXT,
     by_hand="""
 ```sh

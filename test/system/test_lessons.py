@@ -82,7 +82,7 @@ def test_what_a_page_says_is_borne_out(name: str, runs: int) -> None:
 
 def test_the_program_writes_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert PROGRAM["main"](["late_stamps", "--out", str(tmp_path)]) == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["late_stamps.md", "late_stamps.png"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["README.md", "late_stamps.md", "late_stamps.png"]
     assert "late_stamps: Stamps that are 0.2 s late" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         PROGRAM["main"](["no_such_lesson"])
