@@ -17,8 +17,10 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
 import tempfile
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -44,9 +46,10 @@ TARGET_LATENCY = 1.0
 QUIET_LOAD = 0.3
 
 
-def measure(rate: float, seconds: float, is_late: bool) -> dict[str, float]:
+def measure(rate: float, seconds: float, is_late: bool, through: Sequence[str] = ()) -> dict[str, float]:
     """One run: `processor` (% of a core), `lost`, and of `measured` latencies `p50`, `p99` and `max` (ms).
 
+    `megabytes`: what the node had resident at its most. ``through``: command that the node is started with.
     Raises RuntimeError when a process fails, or the state was not GOOD in time.
     """
     with tempfile.TemporaryDirectory() as folder, ExitStack() as processes:
@@ -58,21 +61,24 @@ def measure(rate: float, seconds: float, is_late: bool) -> dict[str, float]:
             "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]),
         }
 
-        def start(*words: object) -> Process:
-            process = Process([sys.executable, *map(str, words)], environment)
+        def start(*words: object, through: Sequence[str] = ()) -> Process:
+            process = Process([*through, sys.executable, *map(str, words)], environment)
             processes.callback(process.stop)
             return process
 
-        node = start("-m", "eskf_ros.ros_node.main", "--ros-args", "--params-file", CONFIG)
+        node = start("-m", "eskf_ros.ros_node.main", "--ros-args", "--params-file", CONFIG, through=through)
         receiver = start(ENDS, "receive", received)
         sender = start(ENDS, "send", sent, node.popen.pid, rate, seconds, int(is_late))
         sender.popen.wait()
+        memory = Path(f"/proc/{node.popen.pid}/status")
+        peak = re.search(r"VmHWM:\s*(\d+)", memory.read_text() if memory.exists() else "")
         for process in (sender, receiver, node):
             code = process.stop()
             if code:
                 raise RuntimeError(f"{' '.join(map(str, process.popen.args))} ended with {code}:\n{process.output}")
         with np.load(sent) as from_sender, np.load(received) as from_receiver:
-            return figures({**from_sender, **from_receiver}, is_late)
+            found = figures({**from_sender, **from_receiver}, is_late)
+        return {**found, "megabytes": int(peak[1]) / 1024.0 if peak else float("nan")}
 
 
 def figures(found: dict[str, np.ndarray], is_late: bool) -> dict[str, float]:

@@ -108,9 +108,9 @@ def launch(ros: Ros, tmp_path: Path) -> Callable[..., Process]:
     for folder in (executables, share, index):
         folder.mkdir(parents=True)
     (index / "eskf_ros").touch()
-    for command in ("node", "replay"):
+    for command, room in (("node", "ros_node"), ("replay", "replay")):
         script = executables / f"eskf_{command}"
-        script.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m eskf_ros.{command}.main "$@"\n')
+        script.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m eskf_ros.{room}.main "$@"\n')
         script.chmod(0o755)
     prefixes = os.pathsep.join(filter(None, [str(prefix), os.environ.get("AMENT_PREFIX_PATH")]))
 
