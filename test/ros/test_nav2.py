@@ -90,9 +90,13 @@ def test_the_node_has_the_topics_and_frames_of_dual_ekf_navsat(ros: Ros, drive: 
     nav2 = Navigation(ros)
     nav2.play(drive)
     last_stamp = max(at for at, topic, _ in drive if topic == "imu")
-    newest = lambda: nav2.seen["/odometry/global"][-1].header.stamp  # noqa: E731
-    ros.until(lambda: newest().sec * 10**9 + newest().nanosec > last_stamp - 200_000_000, 20.0, "the last odometry")
 
+    def is_through(topic: str) -> bool:
+        newest = nav2.seen[topic][-1].header.stamp
+        return bool(newest.sec * 10**9 + newest.nanosec > last_stamp - 200_000_000)
+
+    # On a busy machine the observer is behind: each topic has its own queue.
+    ros.until(lambda: is_through("/odometry/global") and is_through("/odometry/local"), 60.0, "the last odometry")
     for topic, frame in (("/odometry/global", "map"), ("/odometry/local", "odom")):
         message = nav2.seen[topic][-1]
         assert (message.header.frame_id, message.child_frame_id) == (frame, "base_footprint")
