@@ -129,8 +129,8 @@ from std_msgs.msg import Empty
 from eskf_ros.ros_node import main, node
 
 class Stalled(node.EskfNode):
-    def __init__(self):
-        super().__init__()
+    def __init__(self, **options):
+        super().__init__(**options)
         self.create_subscription(Empty, "stall", lambda message: time.sleep(1.8), 1)
 
 node.EskfNode = Stalled
