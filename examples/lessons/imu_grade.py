@@ -32,8 +32,8 @@ Horizontal error, median (in brackets: the sigma that the filter published):
 For the first ten seconds the grades are nearly alike: what counts is how well velocity and tilt were known at the
 entrance, and this the receiver decides. Then each error grows by its own power of time: velocity with t, tilt and
 accelerometer bias with t², gyro bias with t³, white noise of the accelerometer with t^1.5. On the double logarithmic
-picture these are slopes, and late in the tunnel all lines are steeper than t². So the doubling of the time costs five
-to ten times the error, and ten times the money for the IMU buys two to three times the time.
+picture these are slopes, and late in the tunnel every sigma grows faster than t². So twice the time
+costs several times the error, and the next better grade, for a multiple of the money, less than doubles the time.
 
 ## What to take home
 

@@ -32,9 +32,9 @@ noise and bias random walks are, the other a tenth of it, as one does with a dat
 
 Under open sky nothing gives the lie away: the error is the same, sigma is the same, since the receiver determines both,
 and the innovations are the same to a few per cent. Tuned by looking at a trajectory both pass. In the tunnel the second
-filter claims {end_sigma_lying} m and is {end_lying} m off. It is not much worse than the honest one; it is dangerous.
-A planner keeps a distance by it, a gate built with it refuses the true fixes at the exit, and what it is sure of
-(biases, heading) it no longer corrects.
+filter claims {end_sigma_lying} m and is {end_lying} m off. It is worse than the honest one, too, since it has stopped
+to correct the biases that it is sure of; but the claim is what makes it dangerous. A planner keeps a distance by it,
+and a gate built with it refuses the true fixes at the exit.
 
 How does one find out? With truth: NEES, the error in units of its own covariance, e' P⁻¹ e. For two axes it has the
 mean 2, and is below {bound} in 95 % of the drives; the right picture shows it drive by drive. One drive says little, an
