@@ -185,17 +185,18 @@ def fix_with_std(std: float) -> Any:
 
 @pytest.mark.parametrize(("std", "renewed"), [(1.0, False), (1.9, False), (0.6, False), (0.02, True), (5.0, True)])
 def test_another_kind_of_solution_has_another_error(std: float, renewed: bool) -> None:
-    state = joined(3)
+    states = np.repeat(np.atleast_1d(joined(3)), 2)
+    state = states[0]
     state["window"]["last_fix_variance"] = 2.0
-    reset_for_new_solution(state, fix_with_std(std), LASTING)
+    reset_for_new_solution(states, fix_with_std(std), LASTING, make_work())
     assert (state["covariance"][PLACE, :3] == 0.0).all() == renewed
     assert (state["optional"][:3] == 0.0).all() == renewed
     if renewed:
         np.testing.assert_array_equal(state["covariance"][PLACE:SIZE, :SIZE], np.eye(3, SIZE, PLACE))
     # From now on that is its kind.
-    after = copy_of(state)
-    reset_for_new_solution(state, fix_with_std(std), LASTING)
-    assert state.tobytes() == after.tobytes()
+    after = states.copy()
+    reset_for_new_solution(states, fix_with_std(std), LASTING, make_work())
+    assert states.tobytes() == after.tobytes()
 
 
 def with_lasting_errors(recording: Recording, std: float, share: float, seed: int) -> Recording:
