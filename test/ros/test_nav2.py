@@ -14,7 +14,7 @@ import pytest
 from eskf_ros.bags import encode, open_bag
 from eskf_ros.geodesy.map_frame import MapFrame
 from eskf_ros.simulate.main import main as simulate
-from support.robot import ROOT, start_node
+from support.robot import FIRST_START, ROOT, start_node
 from support.ros_process import Ros, needs_ros
 
 pytestmark = needs_ros
@@ -77,7 +77,9 @@ class Navigation:
         self.publishers = {topic: ros.node.create_publisher(kind, f"/{topic}", 10_000) for topic, kind in kinds.items()}
 
     def play(self, drive: list[tuple[int, str, bytes]]) -> None:
-        self.ros.until(lambda: all(p.get_subscription_count() for p in self.publishers.values()), 90.0, "the node")
+        self.ros.until(
+            lambda: all(p.get_subscription_count() for p in self.publishers.values()), FIRST_START, "the node"
+        )
         begin = time.monotonic()
         for log_time, topic, data in drive:
             while time.monotonic() - begin < (log_time - drive[0][0]) * 1e-9 / SPEED:

@@ -10,7 +10,7 @@ import pytest
 
 from eskf_ros.simulate.scenario import simulate
 from support.hostile_traffic import Listener, Phase, drive, mixed, not_finite, play, position_errors, resident_megabytes
-from support.robot import CONFIG, start_node
+from support.robot import CONFIG, FIRST_START, start_node
 from support.ros_process import Ros, needs_ros
 
 pytestmark = needs_ros
@@ -38,7 +38,9 @@ def test_a_minute_of_hostile_traffic(ros):
     recording = simulate("hour_drive", seed=11, truth_rate=200.0, start=8.0, stop=70.0)
     node = start_node(ros, "--params-file", str(CONFIG))
     listener = Listener(ros)
-    ros.until(lambda: all(p.get_subscription_count() for p in listener.publishers.values()), 180.0, "the node to start")
+    ros.until(
+        lambda: all(p.get_subscription_count() for p in listener.publishers.values()), FIRST_START, "the node to start"
+    )
     first_stamp, begin = time.time_ns(), time.monotonic()
     messages = list(mixed(drive(recording, first_stamp), first_stamp, PHASES, seed=1))
     end, memory = 0.0, []

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from support.robot import FIRST_START
 from support.ros_process import Ros, needs_ros
 
 pytestmark = needs_ros
@@ -29,7 +30,7 @@ def test_the_file_of_the_user_goes_before_the_profile_and_the_command_line_befor
     given = ["--ros-args", "--params-file", str(own), "-p", "nhc.vertical_std:=0.5"]
     ros.spawn([sys.executable, "-m", "eskf_ros.ros_node.main", "--profile", "tractor", *given])
     client = ros.node.create_client(GetParameters, "/eskf_node/get_parameters")
-    ros.until(client.service_is_ready, 90.0, "the node")
+    ros.until(client.service_is_ready, FIRST_START, "the node")
     names = ["nhc.angle_std_deg", "nhc.lateral_std", "nhc.vertical_std"]
     answer = client.call_async(GetParameters.Request(names=names))
     ros.until(answer.done, 30.0, "its parameters")

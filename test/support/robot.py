@@ -18,6 +18,8 @@ TYPES = {
     "gps/fix": "sensor_msgs/msg/NavSatFix",
     "gps/vel": "geometry_msgs/msg/TwistWithCovarianceStamped",
 }
+FIRST_START = 300.0
+"""s; the longest start of a node: the first one after an edit of the kernels compiles them."""
 SECONDS = 32.0
 SPEED = 4.0
 
@@ -77,7 +79,7 @@ class Robot:
         def is_ready() -> bool:
             return bool(self.diagnostics) and all(p.get_subscription_count() for p in self.publishers.values())
 
-        self.ros.until(is_ready, 90.0, "the node to subscribe and to report")
+        self.ros.until(is_ready, FIRST_START, "the node to subscribe and to report")
 
     def play(
         self,

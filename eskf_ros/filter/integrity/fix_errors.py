@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.integrity.installation_monitor import unmodelled_position
+from eskf_ros.filter.integrity.installation_monitor import LEAST_INTERVAL, unmodelled_position
 from eskf_ros.filter.integrity.scatter import FEWEST_PAIRS, LARGEST_SPREAD, NOTABLE_SCATTER
 from eskf_ros.filter.measurements.gnss_position import LEAST_WHITE, noise_shares
 from eskf_ros.filter.state.augmented_states import reset_augmented, update_error_size
@@ -28,9 +28,6 @@ NOTABLE_CALM = 0.5
 
 FEWEST_WILD_PAIRS = 3.0
 """Pairs of fixes before which even changes far beyond the claims say nothing."""
-
-LEAST_INTERVAL = 0.05
-"""s; shortest interval of fixes."""
 
 LEAST_LASTING = 1.0
 """Least variance of a lasting error, over that of the new errors, that is worth the augmented states."""

@@ -81,8 +81,10 @@ LONG_WINDOW = 2.0
 
 LONGEST_WINDOW = 3.5
 """s; a window that an outage has made longer is not judged."""
+
 RECENT = SECOND
 """ns; velocities count as coming if one has come for so short a time before the last fix, or later."""
+
 JUMP_SIGMAS = 5.5
 """Standard deviations per axis of the difference of two fixes by which it must be off for a jump."""
 
