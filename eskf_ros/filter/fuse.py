@@ -70,7 +70,9 @@ def fuse(states, aids, i, settings, work):
         return
     if aid.stream == Stream.GNSS_POSITION:
         gnss_position.fill_altitude(state, aid.payload, aid.source, settings)
-    watch_motion(state, aid, settings)
+    if state.level_known == 1:
+        # What came before the first sample that counts must leave no trace, and no window may begin with it.
+        watch_motion(state, aid, settings)
     update_motion_evidence(state, aid, settings)
     if aid.stream == Stream.GNSS_POSITION and state.level_known == 1 and state.position_known == 0:
         begin(state, aid, settings)
