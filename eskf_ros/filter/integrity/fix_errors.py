@@ -176,9 +176,10 @@ def reset_scatter(state, lane, source, is_better, settings, work):
 
 @njit
 def forget_spread(state, lane, settings):
-    """Forget how far fixes were from a path that was wrong, and the lasting errors that were concluded from it."""
+    """Forget how far fixes and velocities were from a path that was wrong, and the lasting errors concluded from it."""
     for source in range(SOURCES):
         state.scatter.spread[source] = 1.0
+        state.scatter.velocity[source] = 1.0
         if state.scatter.lasting[source] > 0.0:
             state.scatter.lasting[source] = 0.0
             if settings.position_error_at < state.error_size:
