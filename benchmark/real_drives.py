@@ -50,7 +50,7 @@ Array = NDArray[np.float64]
 
 RESULTS = ROOT / "docs" / "results.md"
 FIGURE = ROOT / "docs" / "real_drives.png"
-ODOMETRY_TOPIC = "odometry/global"
+ODOMETRY_TOPIC = "/odometry/global"
 AXES = ("horizontal", "vertical")
 STATISTICS = ("rms", "p50", "p95", "max")
 HEADINGS = ("input", "horizontal, m", "vertical, m", "NIS", "NEES", "outside the gate", "restarts")

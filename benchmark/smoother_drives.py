@@ -21,8 +21,8 @@ sys.path.insert(0, str(ROOT / "test"))
 
 from eskf_ros.replay.main import main as replay  # noqa: E402
 from support.data import find_data_folder  # noqa: E402
-from support.recordings.car_ontario_mounted import DRIVES, car_ontario_recording  # noqa: E402
-from support.recordings.car_ontario_mounted import OUTAGE_SETS as ONTARIO_OUTAGES  # noqa: E402
+from support.recordings.car_ontario import DRIVES, car_ontario_recording  # noqa: E402
+from support.recordings.car_ontario import OUTAGE_SETS as ONTARIO_OUTAGES  # noqa: E402
 from support.recordings.common import Outages, Recording, results_folder  # noqa: E402
 from support.recordings.drive_0708 import OUTAGE_SETS as RURAL_OUTAGES  # noqa: E402
 from support.recordings.drive_0708 import drive_0708_recording  # noqa: E402

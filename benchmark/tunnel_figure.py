@@ -45,7 +45,7 @@ def main() -> None:
     """Replay, compare, draw."""
     with tempfile.TemporaryDirectory() as folder:
         summary = replay(BAG, load(ROOT / "config" / "tunnel_drive.yaml"), Options(Path(folder), truth="truth"))
-        estimate = read_odometry(Path(folder) / "odometry.mcap", "odometry/global")
+        estimate = read_odometry(Path(folder) / "odometry.mcap", "/odometry/global")
     truth = read_odometry(BAG, "truth")
     truth_position = to_map(truth["position"], summary["datum"])
     seconds = (estimate["stamp"] - truth["stamp"][0]) * 1e-9

@@ -1,27 +1,24 @@
-"""car_ontario (yongkyuns/imu_gnss_fusion): a car, seven drives, a consumer IMU at 99.5 Hz in odd mounts, GNSS at 2 Hz.
+"""car_ontario (yongkyuns/imu_gnss_fusion): seven drives of a car, consumer IMU in any orientation, receiver at 2 Hz.
 
-Fixes and velocities are those of the receiver with its standard deviations. Its own running estimate of the mounting of
-the IMU is what a calibration is compared with: the last row is the settled one. Antenna and rear axle are not known.
+The receiver's own settled estimate of how the IMU is mounted is used as it stands. Lever arm and rear axle are unknown.
 """
 
 from __future__ import annotations
 
-import gzip
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from support.recordings.common import (
     GNSS_LATENCY,
     STATUS_FIX,
-    Array,
     Fixes,
     Recording,
     diagonal,
     gnss_fix,
     gnss_velocity,
     imu,
+    truth_fix,
     write_bag,
 )
 
@@ -35,38 +32,34 @@ DRIVES = (
     "mixed-road-long-drive-large-mount-001",
 )
 
-EPOCH = 1.6e9
-"""s; the files count from the start of the drive, stamps have to be of some day."""
+START = 1_700_000_000.0
+"""s of Unix time; the recordings count from zero."""
 
-INSTALLATION = """\
-/**:
-  ros__parameters:
-    imu.mount_rpy_deg: [0.0, 0.0, 0.0]
-"""
+OUTAGE_SETS = {
+    name: tuple(tuple((start, 30.0) for start in np.arange(first, last, 120.0).tolist()) for first in (60.0, 120.0))
+    for name, last in zip(DRIVES, (140.0, 270.0, 490.0, 450.0, 620.0, 1210.0, 1230.0))
+}
+"""Outages (start, length in s) of each drive: every 120 s, in two staggered replays."""
 
 
-def car_ontario_recording(folder: Path, source: Path, drive: str) -> Recording:
-    """Write one of `DRIVES` (below the folder `source`) to `folder`; its IMU has no mounting in the parameters."""
-    readings, solution = read(source / drive / "imu.csv.gz"), read(source / drive / "gnss.csv.gz")
-    time = solution[:, 0] + EPOCH
-    fixes = Fixes(time, solution[:, 1:4], diagonal(solution[:, [8, 7, 9]]), np.full(len(time), STATUS_FIX, np.int8))
+def car_ontario_recording(folder: Path, source: Path, name: str) -> Recording:
+    """Write one of the `DRIVES` of car_ontario (the folder `source`) to `folder`; its fixes are the truth, too."""
+    samples, solution, mount = (
+        np.loadtxt(source / name / f"{table}.csv.gz", delimiter=",", skiprows=1)
+        for table in ("imu", "gnss", "reference_mount")
+    )
+    time, solution_time = START + samples[:, 0], START + solution[:, 0]
+    covariance = diagonal(solution[:, [8, 7, 9]])
+    fixes = Fixes(solution_time, solution[:, 1:4], covariance, np.full(len(solution), STATUS_FIX, np.int8))
     velocity = solution[:, [5, 4, 6]] * (1.0, 1.0, -1.0)
-    bag = folder / f"{drive}.mcap"
+    bag = folder / f"{name}.mcap"
     write_bag(
         bag,
-        imu(readings[:, 0] + EPOCH, readings[:, 4:7], readings[:, 1:4]),
+        imu(time, samples[:, 4:7], samples[:, 1:4]),
         gnss_fix(fixes, 0.0),
-        gnss_velocity(time, velocity, solution[:, [11, 10, 12]], time + GNSS_LATENCY),
+        gnss_velocity(solution_time, velocity, solution[:, [11, 10, 12]], solution_time + GNSS_LATENCY),
+        truth_fix(fixes, 0.0),
     )
-    return Recording(bag, INSTALLATION, "")
-
-
-def reference_mounting(source: Path, drive: str) -> Rotation:
-    """IMU to vehicle, as the receiver has settled on it."""
-    return Rotation.from_euler("xyz", read(source / drive / "reference_mount.csv.gz")[-1, 1:4], degrees=True)
-
-
-def read(path: Path) -> Array:
-    """The numbers of a compressed CSV file."""
-    with gzip.open(path, "rt", encoding="ascii") as file:
-        return np.loadtxt(file, delimiter=",", skiprows=1)
+    roll, pitch, yaw = mount[-1, 1:4].tolist()
+    installation = f"/**:\n  ros__parameters:\n    imu.mount_rpy_deg: [{roll}, {pitch}, {yaw}]\n"
+    return Recording(bag, installation, "")
