@@ -62,21 +62,27 @@ def assert_consistent(summary: dict[str, Any], nees_in_95: float, nis_in_95: flo
             assert aid["nis_in_95"] > nis_in_95, name
 
 
-def assert_never_lost(summary: dict[str, Any]) -> None:
+HOLES = r"the data of the IMU have 9 holes, 14.6 s in all"
+"""A warning that is true of KITTI."""
+DEPARTURES = r"the receiver and the IMU went different ways"
+"""A warning that is true in a town (multipath), and where a gyro that reads too much is no part of its noise."""
+
+
+def assert_never_lost(summary: dict[str, Any], true: str = "") -> None:
     """Neither the alignment nor the position started again."""
-    assert_aligned_once(summary)
+    assert_aligned_once(summary, true)
     assert summary["position_resets"] == 0
 
 
-def assert_aligned_once(summary: dict[str, Any]) -> None:
+def assert_aligned_once(summary: dict[str, Any], true: str = "") -> None:
     """The alignment did not start again: the summary has no warning, and no fix waited for a second alignment.
 
     But these: that the noise of the IMU is too small for the outages, that fixes in a town claim too much, jump and err
-    together for long, and that stamps jitter, where they do.
+    together for long, that stamps jitter, where they do, and the one that is `true` of this recording.
     """
     known = r"after \d+ outages|the fixes (scatter|jumped|change by)|IMU stamps jitter|\d+ (times|of \d+) fixes"
     told = [text for text in summary["warnings"] if not re.match(known, text)]
-    assert told == []
+    assert [text for text in told if not (true and re.match(true, text))] == []
     refused = [aid["verdicts"].get("before_alignment", 0) for aid in summary["aids"].values()]
     assert max(refused) <= BEFORE_ALIGNMENT
 
@@ -91,7 +97,7 @@ def outage_errors(summaries: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarr
 def test_kitti_with_a_position_every_ten_seconds(kitti: Callable[[bool], Recording]) -> None:
     recording = kitti(False)
     summary = replayed(recording)
-    assert_never_lost(summary)
+    assert_never_lost(summary, HOLES)
     assert summary["truth"]["compared"] > 270
     assert_within(summary, "horizontal", rms=4.98, p50=0.46, p95=12.0, max=29.3)
     assert_within(summary, "vertical", rms=0.54, p50=0.17, p95=1.02, max=2.9)
@@ -101,7 +107,7 @@ def test_kitti_with_a_position_every_ten_seconds(kitti: Callable[[bool], Recordi
 def test_kitti_with_velocity_every_ten_seconds(kitti: Callable[[bool], Recording]) -> None:
     recording = kitti(True)
     summary = replayed(recording)
-    assert_never_lost(summary)
+    assert_never_lost(summary, HOLES)
     assert_within(summary, "horizontal", rms=2.32, p50=0.34, p95=4.7, max=18.7)
     assert_within(summary, "vertical", rms=0.46, p50=0.17, p95=0.95, max=2.4)
     assert_consistent(summary, nees_in_95=0.95, nis_in_95=0.92)
@@ -148,7 +154,7 @@ def test_kitti_with_default_noise_is_never_lost(kitti: Callable[[bool], Recordin
     for with_velocity, rms, most in ((False, 5.4, 13.6), (True, 2.7, 4.9)):
         recording = kitti(with_velocity)
         summary = replayed(recording, chosen_noise=False)
-        assert_never_lost(summary)
+        assert_never_lost(summary, HOLES)
         assert_within(summary, "horizontal", rms=rms, p95=most)
 
 
@@ -156,11 +162,11 @@ def test_drive_0708_with_default_noise_is_never_lost(drive_0708: Callable[[bool]
     for with_velocity in (False, True):
         recording = drive_0708(with_velocity)
         summary = replayed(recording, chosen_noise=False)
-        assert_never_lost(summary)
+        assert_never_lost(summary, DEPARTURES)
         # A gyro that reads 1 deg/s too much for three seconds is more than the default noise says.
         assert_within(summary, "horizontal", rms=0.060, p50=0.017, p95=0.07, max=0.8)
         for outages in OUTAGE_SETS:
-            assert_never_lost(replayed(recording, outages=outages, chosen_noise=False))
+            assert_never_lost(replayed(recording, outages=outages, chosen_noise=False), DEPARTURES)
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +180,7 @@ def tokyo_summaries(
 
 def test_tsukishima_is_never_lost_among_wrong_fixes(tokyo_summaries: list[dict[str, Any]]) -> None:
     for summary, rms in zip(tokyo_summaries, (0.19, 0.215)):
-        assert_aligned_once(summary)
+        assert_aligned_once(summary, DEPARTURES)
         assert summary["truth"]["compared"] > 4200
         assert_within(summary, "horizontal", rms=rms, p50=0.079, p95=0.37)
         assert_within(summary, "vertical", rms=0.22, p50=0.071, p95=0.27)
