@@ -94,8 +94,8 @@ setup(
             "ruff",
             "sidereon; sys_platform == 'linux' and platform_machine == 'x86_64'",
         ],
-        # Beside [test]: the benchmarks that draw figures.
-        "benchmark": ["matplotlib"],
+        # Beside [test]: the benchmarks that draw figures, and the one that compares with other filters.
+        "benchmark": ["evo", "matplotlib"],
     },
     entry_points={
         "console_scripts": [
