@@ -36,7 +36,7 @@ ROS_PACKAGES = {
 # Imported by the tests alone.
 ROS_TEST_PACKAGES = {"rosgraph_msgs", "std_msgs"}
 # Used where somebody else has installed it.
-OPTIONAL = {"pandas", "robot_localization", "pygeomag"}
+OPTIONAL = {"distributed", "evo", "pandas", "pygeomag", "robot_localization"}
 # Import name -> rosdep key that brings it, where it is not python3-NAME.
 ROSDEP_KEYS = {
     "lz4": "mcap-ros2-support",
