@@ -120,8 +120,8 @@ setup(
         "docs": ["furo", "myst-parser>=4", "sphinx>=8", "sphinxcontrib-mermaid"],
         # The pictures of examples/lessons: small PNG files that a page of Markdown shows, which Bokeh does not make.
         "lessons": ["matplotlib"],
-        # Beside [test]: the benchmarks that draw figures.
-        "benchmark": ["matplotlib"],
+        # Beside [test]: the benchmarks that draw figures, and the one that compares with other filters.
+        "benchmark": ["evo", "matplotlib"],
     },
     entry_points={
         "console_scripts": [

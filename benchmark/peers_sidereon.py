@@ -28,6 +28,10 @@ SATELLITES = 10
 """Number of satellites that is told with a fix; NavSatFix does not have it."""
 
 
+class GaveUpError(Exception):
+    """The filter of a peer refused a state or a message."""
+
+
 @dataclass(frozen=True)
 class Inputs:
     """What a filter is given: IMU samples, and fixes of the antenna that were not withheld, by stamp (ns).
@@ -81,7 +85,7 @@ def _filter(
     covariance[3:6, 3:6] = base_to_ecef @ start["twist_covariance"][:3, :3] @ base_to_ecef.T
     covariance[6:9, 6:9] = to_ecef @ start["pose_covariance"][3:, 3:] @ to_ecef.T
     covariance[9:12, 9:12] = np.diag(start["accel_bias_std"] ** 2)
-    covariance[12:, 12:] = np.diag(np.square(HELD if holds_gyro_bias else start["gyro_bias_std"])) * np.eye(3)
+    covariance[12:, 12:] = np.diag(np.full(3, HELD**2) if holds_gyro_bias else start["gyro_bias_std"] ** 2)
     symmetric = 0.5 * (covariance + covariance.T)
     state = sidereon.InsFilterState.from_covariance(nominal, sidereon.ErrorStateLayout.FIFTEEN, symmetric)
     imu, lever = parameters.imu, turn.T @ np.subtract(parameters.gnss.lever_arm, parameters.imu.mount_position)
@@ -159,15 +163,18 @@ def run_loose(
     engine = _filter(sidereon, kind, start, frame, parameters, holds_gyro_bias)
     states = []
     began = time.process_time()
-    for index, stamp in enumerate(stamps[1:].tolist()):
-        step = float(steps[index])
-        engine.propagate(
-            sidereon.ImuSample.increment(float(at[index + 1]), delta_velocity[index], delta_angle[index], step)
-        )
-        fix = fixes.get(stamp)
-        if fix is not None:
-            engine.update_loose(fix)
-        states.append(engine.state)
+    try:
+        for index, stamp in enumerate(stamps[1:].tolist()):
+            step = float(steps[index])
+            engine.propagate(
+                sidereon.ImuSample.increment(float(at[index + 1]), delta_velocity[index], delta_angle[index], step)
+            )
+            fix = fixes.get(stamp)
+            if fix is not None:
+                engine.update_loose(fix)
+            states.append(engine.state)
+    except ValueError as error:
+        raise GaveUpError(str(error)) from error
     used = time.process_time() - began
     return Run(_rows(states, stamps[1:], frame, parameters), 1e6 * used / len(states))
 

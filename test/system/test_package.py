@@ -40,7 +40,7 @@ ROS_TEST_PACKAGES = {"rosgraph_msgs", "std_msgs"}
 ROS_TEST_TOOLS = {"ament_flake8", "ament_pep257", "ament_xmllint"}
 ADDRESS = "https://github.com/eskf-ros/eskf_ros"
 # Used where somebody else has installed it.
-OPTIONAL = {"bokeh", "distributed", "pandas", "robot_localization", "pygeomag"}
+OPTIONAL = {"bokeh", "distributed", "evo", "pandas", "robot_localization", "pygeomag"}
 # What `eskf_calibrate --static` imports when it is asked for: the extra [calibrate].
 CALIBRATE = {"allantools", "matplotlib"}
 # Import name -> rosdep key that brings it, where it is not python3-NAME.
