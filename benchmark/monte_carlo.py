@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from eskf_ros.filter.history.records import RECORD
+from eskf_ros.filter.integrity.installation_monitor import CONSIDERED_SIGMAS, FAULT_PRIOR, LARGEST_FAULT
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import STREAM_NAMES, Verdict
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, VELOCITY
@@ -180,11 +181,20 @@ def run(recording: Recording, navigator: Navigator, interval: float = 0.5) -> Ru
 
 
 def published_covariance(states: np.void | NDArray[Any]) -> Array:
-    """Return the covariances of one state or of many (...,), with the lasting errors of fixes that odometry adds."""
+    """Return the covariances of one state or of many (...,), with what odometry adds.
+
+    That is lasting errors of fixes, and the effect of faults of the installation that were found.
+    """
     covariance = np.array(states["covariance"])
     scatter = states["scatter"]
     held = (scatter["share"] ** 2 * (scatter["calm"][..., None] * scatter["claimed"])).sum(axis=-2)
     covariance[..., np.arange(3), np.arange(3)] += held
+    found = states["installation"]
+    sizes = found["estimate"]
+    is_likely = np.abs(sizes) > CONSIDERED_SIGMAS * found["sigma"]
+    sizes = np.where(is_likely & (np.abs(sizes) < LARGEST_FAULT * np.array(FAULT_PRIOR)), sizes, 0.0)
+    effects = found["absorbed"][..., :ERROR_SIZE, :] * sizes[..., None, :]
+    covariance[..., :ERROR_SIZE, :ERROR_SIZE] += np.einsum("...sik,...sjk->...ij", effects, effects)
     return covariance
 
 

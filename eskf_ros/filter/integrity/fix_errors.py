@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.integrity.installation_monitor import LEAST_INTERVAL, unmodelled_position
+from eskf_ros.filter.integrity.installation_monitor import FAULTS, LEAST_INTERVAL
 from eskf_ros.filter.integrity.scatter import FEWEST_PAIRS, LARGEST_SPREAD, NOTABLE_SCATTER
 from eskf_ros.filter.measurements.gnss_position import LEAST_WHITE, noise_shares
 from eskf_ros.filter.state.augmented_states import reset_augmented, update_error_size
@@ -73,10 +73,7 @@ def update_lasting_share(state, lane, source, used, settings, work):
     """Update the share of the lasting error that is estimated; ``used`` is the new share in ``work.noise``."""
     scatter = state.scatter
     white, spread, lasting = scatter.white[source], scatter.spread[source], scatter.lasting[source]
-    off = unmodelled_position(state, source)
-    claimed = (work.noise[0, 0] + work.noise[1, 1]) / (2.0 * used)
     found = max(spread if spread > NOTABLE_SCATTER else 1.0, white) - white
-    found = max(found, min(off * off / claimed, LARGEST_SPREAD))
     found = max(found, lasting * largest_square(state, settings.position_error_at) / LARGEST_VALUE**2)
     found = found if found > LEAST_LASTING * white else 0.0
     if found <= STEADY * lasting and found * STEADY >= lasting:
@@ -84,9 +81,7 @@ def update_lasting_share(state, lane, source, used, settings, work):
     scatter.lasting[source] = found
     if found == 0.0:
         return
-    factor = found / used
-    if off == 0.0:
-        factor *= followed_part(state, source) if lasting == 0.0 else 0.0
+    factor = found / used * (followed_part(state, source) if lasting == 0.0 else 0.0)
     inflate_lasting_error(state, lasting, found, factor, settings, work)
     if state.heading_known == 1:
         inflate_lasting_error(lane, lasting, found, factor, settings, work)
@@ -120,9 +115,9 @@ def largest_square(state, place):
 def inflate_lasting_error(state, before, now, factor, settings, work):
     """Change the scale of the lasting error from the share ``before`` to ``now``; the value stays.
 
-    Where it may be in the position, too, which has followed it (a wrong lever arm), the position is widened by
-    ``factor`` times the noise in ``work``: the two are the same with opposite signs. An error that is seen because the
-    position has not followed it leaves the position as it is.
+    Where it may be in the position, too, which has followed it, the position is widened by ``factor`` times the noise
+    in ``work``: the two are the same with opposite signs. An error that is seen because the position has not followed
+    it leaves the position as it is.
     """
     place = settings.position_error_at
     update_error_size(state, place + 3, settings)
@@ -134,6 +129,9 @@ def inflate_lasting_error(state, before, now, factor, settings, work):
         # Another scale: for a smoother it is another error.
         state.forward.renewed |= 1 << (i - ERROR_SIZE)
         state.optional[i - ERROR_SIZE] *= ratio
+        for other in range(SOURCES):
+            for fault in range(FAULTS):
+                state.installation.absorbed[other, i, fault] *= ratio
         for j in range(state.error_size):
             state.covariance[i, j] *= ratio
             state.covariance[j, i] *= ratio

@@ -2,7 +2,8 @@
 
 The antenna is R dl + v dt away from where the filter expects it. The effect of such a fault on the state is carried
 through every prediction and update, and the innovations are compared with what remains of it (Friedland, Treatment of
-bias in recursive filtering, 1969). What is found is allowed for: as a lasting error of the fixes (`scatter`).
+bias in recursive filtering, 1969). What is found is allowed for: what it does to the estimate is in the
+covariance that is published.
 """
 
 from __future__ import annotations
@@ -15,7 +16,16 @@ from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.strapdown import gravity_map
 from eskf_ros.filter.measurements.kalman_update import invert_positive
 from eskf_ros.filter.state.enums import Stream, Verdict
-from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, SOURCES, VELOCITY
+from eskf_ros.filter.state.error_state import (
+    ACCEL_BIAS,
+    ATTITUDE,
+    ERROR_CAPACITY,
+    ERROR_SIZE,
+    GYRO_BIAS,
+    POSITION,
+    SOURCES,
+    VELOCITY,
+)
 from eskf_ros.filter.state.time import NEVER, SECOND
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix
 
@@ -50,6 +60,9 @@ FAULT_PRIOR = (5.0, 5.0, 5.0, 1.0, 1.0)
 FAULT_SIGMAS = 6.0
 """Standard deviations from zero beyond which a fault is reported."""
 
+CONSIDERED_SIGMAS = 4.0
+"""Standard deviations from zero beyond which a fault is allowed for: to be wrong costs certainty only."""
+
 LEVER_ARM_ERROR = 0.05
 """m; smaller errors of the lever arm are not reported."""
 
@@ -69,10 +82,11 @@ INSTALLATION = np.dtype(
     [
         ("stamp", "i8"),
         ("force", "f8", (3,)),
-        ("absorbed", "f8", (SOURCES, ERROR_SIZE, FAULTS)),
+        ("absorbed", "f8", (SOURCES, ERROR_CAPACITY, FAULTS)),
         ("information", "f8", (SOURCES, FAULTS, FAULTS)),
         ("evidence", "f8", (SOURCES, FAULTS)),
         ("checked", "i8"),
+        ("estimate", "f8", (SOURCES, FAULTS)),
         ("found", "f8", (SOURCES, FAULTS)),
         ("sigma", "f8", (SOURCES, FAULTS)),
         ("held", "i8", (SOURCES, FAULTS)),
@@ -82,11 +96,11 @@ INSTALLATION = np.dtype(
 """Estimation of the faults of the installation, by receiver.
 
 - ``stamp``, ``force``: stamp (ns) and specific force (m/s2, map) of its last step.
-- ``absorbed``: derivative of the 15 errors of the core by the faults.
+- ``absorbed``: derivative of the errors, augmented states included, by the faults.
 - ``information``, ``evidence``: normal equations of the faults.
 - ``checked``: when they were solved last (ns).
-- ``found``, ``sigma``: faults that are certain, true minus configured, else 0, and their standard deviations;
-  ``held``: for how many looks in a row they have been so.
+- ``estimate``, ``sigma``: the faults, true minus configured, and their standard deviations.
+- ``found``: those that are certain, else 0; ``held``: for how many looks in a row they have been so.
 """
 
 
@@ -170,10 +184,11 @@ def learn_faults(state, aid, size, gate, work, settings):
         state.installation.information.fill(0.0)
         state.installation.evidence.fill(0.0)
         state.installation.found.fill(0.0)
+        state.installation.estimate.fill(0.0)
         return
     if state.installation.stamp == NEVER:
         absorb_completely(state, settings)
-    dt = carry_absorbed(state)
+    dt = carry_absorbed(state, settings)
     accepted = aid.verdict in (Verdict.FUSED, Verdict.WEIGHED_DOWN, Verdict.TAKEOVER)
     for source in range(SOURCES):
         absorbed = state.installation.absorbed[source]
@@ -184,12 +199,12 @@ def learn_faults(state, aid, size, gate, work, settings):
             for k in range(FAULTS):
                 if not is_own:
                     effect[a, k] = 0.0
-                for i in range(ERROR_SIZE):
+                for i in range(state.error_size):
                     effect[a, k] -= work.jacobian[a, i] * absorbed[i, k]
         if is_own:
             weigh_faults(state, source, dt, min(1.0, gate / max(aid.nis, 1e-9)), work)
         if accepted:
-            for i in range(ERROR_SIZE):
+            for i in range(state.error_size):
                 for k in range(FAULTS):
                     for a in range(size):
                         absorbed[i, k] += work.gain[i, a] * effect[a, k]
@@ -206,7 +221,7 @@ def smoothed_rate(state, rotation):
 
 
 @njit
-def carry_absorbed(state):
+def carry_absorbed(state, settings):
     """Carry the effect of the faults on the state to the present; return the time (s) since the last measurement.
 
     One step of the trapezoidal rule: exact enough for a second of a car's motion, and the fault estimates tolerate
@@ -234,6 +249,8 @@ def carry_absorbed(state):
                 a[POSITION + i, k] += dt * (a[VELOCITY + i, k] + 0.5 * gain)
                 a[VELOCITY + i, k] += gain
                 a[ATTITUDE + i, k] -= dt * turning[i]
+            for i in range(ERROR_SIZE, state.error_size):
+                a[i, k] *= math.exp(-settings.optional_decay[i - ERROR_SIZE] * dt)
     state.installation.stamp = state.stamp
     for i in range(3):
         state.installation.force[i] = force[i]
@@ -286,7 +303,7 @@ def find_faults(state, work):
             estimate = 0.0
             for m in range(FAULTS):
                 estimate += covariance[k, m] * state.installation.evidence[source, m]
-            state.installation.found[source, k] = estimate
+            state.installation.estimate[source, k] = state.installation.found[source, k] = estimate
             widening = excess if k == VELOCITY_TIME else excess + together
             state.installation.sigma[source, k] = math.sqrt(covariance[k, k] * widening)
             largest = max(largest, abs(estimate) / state.installation.sigma[source, k])
@@ -312,16 +329,21 @@ def fixes_together(state, source):
 
 
 @njit
-def unmodelled_position(state, source):
-    """Return the horizontal length (m) by which fixes are off by what was found for long.
+def considered_fault(state, source, fault):
+    """Return the size of a fault that is likely, 0 for others.
 
-    Wrong lever arm (a vertical one is in the height), positions at the wrong time.
+    The estimate is not corrected by it. Its effect (``absorbed``) is held in the covariance that is published, as that
+    of a consider parameter (Schmidt, 1966; Tapley, Schutz and Born, Statistical Orbit Determination, section 6.5).
     """
-    found, held, v = state.installation.found[source], state.installation.held[source], state.velocity_map
-    square = 0.0
-    for k in range(2):
-        if held[k] >= LASTING_LOOKS:
-            square += found[k] ** 2
-    if held[POSITION_TIME] >= LASTING_LOOKS:
-        square += found[POSITION_TIME] ** 2 * (v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
-    return math.sqrt(square)
+    size, sigma = state.installation.estimate[source, fault], state.installation.sigma[source, fault]
+    return size if CONSIDERED_SIGMAS * sigma < abs(size) < LARGEST_FAULT * FAULT_PRIOR[fault] else 0.0
+
+
+@njit
+def considered_variance(state, axis):
+    """Return the variance (m2) of the position on an axis of map that comes from faults that are considered."""
+    total = 0.0
+    for source in range(SOURCES):
+        for k in range(FAULTS):
+            total += (considered_fault(state, source, k) * state.installation.absorbed[source, POSITION + axis, k]) ** 2
+    return total

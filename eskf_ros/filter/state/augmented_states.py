@@ -10,7 +10,7 @@ them: the transition matrix of the core acts on their columns of the covariance 
 from __future__ import annotations
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, VELOCITY
+from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, SOURCES, VELOCITY
 from eskf_ros.geodesy.rotation import cross, dot, to_matrix
 
 
@@ -37,6 +37,8 @@ def reset_augmented(state, place, count, settings):
             covariance[i, j] = 0.0
             covariance[j, i] = 0.0
         covariance[i, i] = settings.optional_std[i - ERROR_SIZE] ** 2
+        for source in range(SOURCES):
+            state.installation.absorbed[source, i].fill(0.0)
 
 
 @njit
