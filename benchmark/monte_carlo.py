@@ -183,7 +183,7 @@ def run(recording: Recording, navigator: Navigator, interval: float = 0.5) -> Ru
 def published_covariance(states: np.void | NDArray[Any]) -> Array:
     """Return the covariances of one state or of many (...,), with what odometry adds.
 
-    That is lasting errors of fixes, and the effect of faults of the installation that were found.
+    That is lasting errors of fixes, the effect of faults of the installation, and that of clocks that are apart.
     """
     covariance = np.array(states["covariance"])
     scatter = states["scatter"]
@@ -195,6 +195,8 @@ def published_covariance(states: np.void | NDArray[Any]) -> Array:
     sizes = np.where(is_likely & (np.abs(sizes) < LARGEST_FAULT * np.array(FAULT_PRIOR)), sizes, 0.0)
     effects = found["absorbed"][..., :ERROR_SIZE, :] * sizes[..., None, :]
     covariance[..., :ERROR_SIZE, :ERROR_SIZE] += np.einsum("...sik,...sjk->...ij", effects, effects)
+    late = states["motion"]["turns"]["lag"][..., None] * states["velocity_map"]
+    covariance[..., :3, :3] += late[..., :, None] * late[..., None, :]
     return covariance
 
 

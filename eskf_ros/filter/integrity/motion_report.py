@@ -7,23 +7,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from eskf_ros.filter.integrity.motion_sums import FEWEST_TURNS, SAME, TURNED
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.time import SECOND
-
-FEWEST_TURNS = 15
-"""Windows with a course from which on turns are compared."""
-
-TURNED = 0.4
-"""rad2; sum of the squares of the changes of course from which on they are."""
 
 LONGEST_COMPARISON = 180 * SECOND
 """ns; after this time without turns or accelerations nothing is waited for."""
 
-SAME, OTHER = 0.7, 0.3
-"""Correlation of changes of course with a gyro from which on it shows them, and below which it does not."""
-
-NOTABLE_LAG = 0.6
-"""s; a time between course and gyro from which on it is told: less is found by the installation monitor."""
+OTHER = 0.3
+"""Correlation of changes of course with a gyro below which it does not show them."""
 
 FEWEST_PUSHES = 30
 """Windows with an acceleration from which on those are compared."""
@@ -90,11 +82,8 @@ def _turn_complaints(turns: np.void) -> list[str]:
     squares = turns["gyro_square"] / weight - of_gyro * of_gyro
     products = turns["product"] / weight - of_gyro * mean
     shown = products / np.sqrt(np.maximum(squares * square, 1e-18))
-    lag = _lag(turns)
-    if (
-        abs(lag) > NOTABLE_LAG
-        and max(shown[2], np.max(turns["shifted"]) / weight / math.sqrt(squares[2] * square)) > SAME
-    ):
+    lag = float(turns["lag"])
+    if lag != 0.0:
         return [
             f"by their turns the receiver is stamped about {abs(lag):.1f} s {'later' if lag > 0.0 else 'earlier'} than "
             "the IMU: the clocks are apart; synchronise the clocks, or set the time_offset of the receiver"
@@ -111,19 +100,6 @@ def _turn_complaints(turns: np.void) -> list[str]:
             "the IMU are swapped, or imu.mount_rpy_deg is wrong"
         ]
     return []
-
-
-def _lag(turns: np.void) -> float:
-    """Return by how much (s) the course is stamped later than the gyro: the top of the parabola through the products.
-
-    The products of the course with the gyro of the same window, the one before and the one after.
-    """
-    before, after = (float(value) for value in turns["shifted"])
-    same = float(turns["product"][2])
-    bend = before - 2.0 * same + after
-    if same + before + after <= 0.0 or bend >= 0.0:
-        return 0.0
-    return 0.5 * (after - before) / bend * float(turns["length"])
 
 
 def _compared(pushes: np.void) -> tuple[np.ndarray, float] | None:

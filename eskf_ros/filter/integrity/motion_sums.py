@@ -21,14 +21,15 @@ TURNS = np.dtype(
         ("shifted", "f8", (2,)),
         ("last", "f8", (2,)),
         ("last_stamp", "i8"),
-        ("length", "f8"),
+        ("lag", "f8"),
     ],
     align=True,
 )
 """Sums over windows of the change of course and the integrated rates (rad, axes of base_link), weighted (1/rad2).
 
 ``shifted``: products of the course with the rate about z of the window before, and of the rate with the course of the
-window before, which ``last``, ``last_stamp`` keep. ``length``: of the last window (s).
+window before, which ``last``, ``last_stamp`` keep. ``lag``: by how much the receiver is stamped later than the IMU (s);
+0 where it is less than notable, or not known.
 """
 
 PUSHES = np.dtype(
@@ -63,6 +64,19 @@ LARGEST_TURN = 1.5
 """rad; within a window course and gyro only turn by more where the robot changes its direction of travel."""
 
 
+FEWEST_TURNS = 15
+"""Windows with a course from which on turns are compared."""
+
+TURNED = 0.4
+"""rad2; sum of the squares of the changes of course from which on they are."""
+
+SAME = 0.7
+"""Correlation of changes of course with a gyro from which on it shows them."""
+
+NOTABLE_LAG = 0.6
+"""s; a time between course and gyro from which on it is told: less is found by the installation monitor."""
+
+
 @njit
 def add_turn(turns, before, after, turn, variance, start, passed):
     """Add the change of course from one velocity to the next, of a ``variance`` (rad2), and the integrated rates.
@@ -84,11 +98,30 @@ def add_turn(turns, before, after, turn, variance, start, passed):
         turns.shifted[1] += weight * turn[2] * turns.last[1]
     turns.last[0], turns.last[1] = turn[2], course
     turns.last_stamp = start + round(passed * 1e9)
-    turns.length = passed
     for i in range(3):
         turns.gyro[i] = remains * turns.gyro[i] + weight * turn[i]
         turns.gyro_square[i] = remains * turns.gyro_square[i] + weight * turn[i] * turn[i]
         turns.product[i] = remains * turns.product[i] + weight * turn[i] * course
+    turns.lag = lag_of(turns, passed)
+
+
+@njit
+def lag_of(turns, length):
+    """Return by how much (s) the course is stamped later than the gyro: the top of the parabola through the products.
+
+    They are those of the course with the gyro of the same window (of a ``length`` in s), the one before and the one
+    after.
+    """
+    before, after, same = turns.shifted[0], turns.shifted[1], turns.product[2]
+    square = turns.course_square - turns.course**2 / turns.weight
+    bend = before - 2.0 * same + after
+    is_enough = turns.count >= FEWEST_TURNS and square * turns.count > TURNED * turns.weight
+    if not is_enough or same + before + after <= 0.0 or bend >= 0.0:
+        return 0.0
+    gyro_square = turns.gyro_square[2] - turns.gyro[2] ** 2 / turns.weight
+    largest = max(max(before, after), same - turns.gyro[2] * turns.course / turns.weight)
+    lag = 0.5 * (after - before) / bend * length
+    return lag if abs(lag) > NOTABLE_LAG and largest > SAME * math.sqrt(gyro_square * square) else 0.0
 
 
 @njit

@@ -110,6 +110,10 @@ def write_odometry(state, local, settings, row):
         for fault in range(FAULTS):
             if considered_fault(state, source, fault) != 0.0:
                 add_considered_fault(state, source, fault, imu_offset, base_to_map, row)
+    lag = state.motion.turns.lag
+    for i in range(3):
+        for j in range(3):
+            row.pose_covariance[i, j] += lag * lag * velocity[i] * velocity[j]
 
 
 @njit

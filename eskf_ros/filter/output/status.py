@@ -87,6 +87,7 @@ def quality_of(state, status, settings):
         variance += (
             state.covariance[POSITION + i, POSITION + i] + held_variance(state, i) + considered_variance(state, i)
         )
+        variance += (state.motion.turns.lag * state.velocity_map[i]) ** 2
     if variance > settings.quality_position_std**2:
         return Quality.TOO_UNCERTAIN
     return Quality.COASTING if status == Status.COASTING else Quality.GOOD
