@@ -14,6 +14,7 @@ the same.
 from __future__ import annotations
 
 import contextlib
+import gc
 import hashlib
 import itertools
 import math
@@ -41,6 +42,13 @@ PROGRESS_PERIOD = 5.0
 
 USUAL_COUNT = 420
 """Functions, each type of arguments counted, that a first start compiles, about: for the estimate of progress only."""
+
+OPTIMISATION = 1
+"""LLVM's level of optimisation. The third costs a fifth more time of the first start and of its memory; these kernels
+are not faster by it (no large loops, no calls that are not inlined anyway)."""
+
+COLLECTION = (20_000, 20, 20)
+"""Thresholds of Python's garbage collector while it compiles: numba makes many objects that stay."""
 
 KEPT_VERSIONS = 4
 """Versions of the machine code of one module that are kept; several checkouts may be in use."""
@@ -189,6 +197,37 @@ def sentence_on_compiling(say: Callable[[str], None]) -> Callable[[int], None]:
     return tell
 
 
+@contextlib.contextmanager
+def _frugally() -> Iterator[None]:
+    """Compile within this with less time and memory than numba by itself; other kernels of the process as they were."""
+    from numba.core import types as numba_types
+
+    record: Any = numba_types.Record
+    level, thresholds, description = numba.config.OPT, gc.get_threshold(), record.__repr__
+    numba.config.OPT = type(level)(min(level, OPTIMISATION))
+    gc.set_threshold(*COLLECTION)
+    # numba describes the arguments to itself before each of its passes, which takes seconds for records in records.
+    record.__repr__ = numba_types.Type.__repr__
+    try:
+        yield
+    finally:
+        numba.config.OPT = level
+        gc.set_threshold(*thresholds)
+        record.__repr__ = description
+
+
+def _compiling_frugally(dispatcher: Any) -> Any:
+    """Make a dispatcher compile so; returns it."""
+    compile_one = dispatcher.compile
+
+    def compile_signature(signature: Any) -> Any:
+        with _frugally():
+            return compile_one(signature)
+
+    dispatcher.compile = compile_signature
+    return dispatcher
+
+
 def _with_few_types(dispatcher: Any) -> Any:
     """Make kernels that call this one agree on its argument types; returns the dispatcher.
 
@@ -254,9 +293,10 @@ if COMPILED:
     def _compiled(function: Function, **options: Any) -> Function:
         # No fast math: fused operations round differently wherever the compiler inlines differently, and two
         # processes would no longer agree to the bit.
-        dispatcher = numba.njit(error_model="numpy", **options)(function)
+        # Nobody calls a kernel from C, so that it needs no wrapper for that.
+        dispatcher = numba.njit(error_model="numpy", no_cfunc_wrapper=True, **options)(function)
         dispatcher._cache = _Cache(function)
-        compiled: Function = _with_few_types(dispatcher)
+        compiled: Function = _with_few_types(_compiling_frugally(dispatcher))
         return compiled
 
     def njit(function: Function) -> Function:

@@ -1,7 +1,6 @@
 """The linters of ament, which a package of ROS is looked at with; where they are not installed, ruff has to do.
 
-ament_copyright is not among them: it wants the whole header of the licence in each file. What REP-2004 asks for, a
-copyright statement in each source file, is a test here.
+ament_copyright is not among them: it wants the whole header of the licence in each file, and LICENSE covers them all.
 """
 
 from __future__ import annotations
