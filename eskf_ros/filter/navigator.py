@@ -219,9 +219,13 @@ class Navigator(Readout):
             sample = Sample(
                 int(stamps[k]), specific_force[k], angular_rate[k], 0 if arrivals is None else int(arrivals[k])
             )
+            steps = len(self._clock.steps)
             false, taken = self._clock.take(sample, self._kept_samples)
             self._buffers.timeline["imu_offered"] += len(false)
             self._buffers.timeline["imu_bad_stamp"] += len(false)
+            if len(self._clock.steps) == steps:
+                # Without a step they are in time as they were when they came, before a newer sample.
+                self._offer_held_aids()
             parts.append(self._push_held(taken))
         return np.concatenate([np.zeros(0, ODOMETRY), *parts])
 
@@ -236,11 +240,15 @@ class Navigator(Readout):
             np.array([sample.rate for sample in samples]),
             arrivals if arrivals.all() else None,
         )
+        self._offer_held_aids()
+        return self._given_out(rows)
+
+    def _offer_held_aids(self) -> None:
+        """Give the measurements that waited with samples to the timeline, if no sample is held any more."""
         if not self._clock.held:
             waiting, self._clock.held_aids = self._clock.held_aids, []
             for offer in waiting:
                 offer()
-        return self._given_out(rows)
 
     def _release_held(self) -> None:
         """Give all samples that are held to the timeline: something has to be final now."""
