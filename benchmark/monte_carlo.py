@@ -20,7 +20,6 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from eskf_ros.filter.history.records import RECORD
-from eskf_ros.filter.integrity.installation_monitor import CONSIDERED_SIGMAS, FAULT_PRIOR, LARGEST_FAULT
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import STREAM_NAMES, Verdict
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, VELOCITY
@@ -190,11 +189,8 @@ def published_covariance(states: np.void | NDArray[Any]) -> Array:
     held = (scatter["share"] ** 2 * (scatter["calm"][..., None] * scatter["claimed"])).sum(axis=-2)
     covariance[..., np.arange(3), np.arange(3)] += held
     found = states["installation"]
-    sizes = found["estimate"]
-    is_likely = np.abs(sizes) > CONSIDERED_SIGMAS * found["sigma"]
-    sizes = np.where(is_likely & (np.abs(sizes) < LARGEST_FAULT * np.array(FAULT_PRIOR)), sizes, 0.0)
-    effects = found["absorbed"][..., :ERROR_SIZE, :] * sizes[..., None, :]
-    covariance[..., :ERROR_SIZE, :ERROR_SIZE] += np.einsum("...sik,...sjk->...ij", effects, effects)
+    effects = found["considered"] * found["is_considered"][..., None]
+    covariance[..., :ERROR_SIZE, :ERROR_SIZE] += np.einsum("...si,...sj->...ij", effects, effects)
     late = states["motion"]["turns"]["lag"][..., None] * states["velocity_map"]
     covariance[..., :3, :3] += late[..., :, None] * late[..., None, :]
     return covariance

@@ -1,4 +1,6 @@
-"""Installation monitor: lever arms and time offsets that are wrong, found from innovations.
+"""Installation monitor: constant faults of receivers and gyros, found from innovations.
+
+Lever arms, time offsets, and a scale error or a steady drift of the bias of the gyros.
 
 The antenna is R dl + v dt away from where the filter expects it. The effect of such a fault on the state is carried
 through every prediction and update, and the innovations are compared with what remains of it (Friedland, Treatment of
@@ -29,15 +31,22 @@ from eskf_ros.filter.state.error_state import (
 from eskf_ros.filter.state.time import NEVER, SECOND
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix
 
-FAULTS = 5
-"""Faults that are estimated for each receiver: three axes of the lever arm (m, body), and the time offsets (s) of
-positions and of velocities."""
+FAULTS = 7
+"""Faults that are estimated for each receiver: three axes of the lever arm (m, body), the time offsets (s) of positions
+and of velocities, scale error of the gyros and drift of their bias (rad/s2): these are one, but each receiver sees
+them."""
 
 POSITION_TIME = 3
 """Index of the time offset of positions among the faults."""
 
 VELOCITY_TIME = 4
 """Index of the time offset of velocities among the faults."""
+
+GYRO_SCALE = 5
+"""Index of the scale error of the gyros, the same for the three, among the faults."""
+
+GYRO_DRIFT = 6
+"""Index of the steady drift of the bias of the gyros about the vertical among the faults."""
 
 LASTING_TIME = 60.0
 """s; correlation time of the errors of fixes that last, as far as the faults are concerned."""
@@ -54,20 +63,30 @@ LARGEST_FAULT = 3.0
 MEMORY = 600.0
 """s; time constant with which the normal equations of the faults forget."""
 
-FAULT_PRIOR = (5.0, 5.0, 5.0, 1.0, 1.0)
-"""Prior standard deviations of the faults (m, m, m, s, s)."""
+FAULT_PRIOR = (5.0, 5.0, 5.0, 1.0, 1.0, 0.03, 1e-4)
+"""Prior standard deviations of the faults (m, m, m, s, s, 1, rad/s2)."""
 
 FAULT_SIGMAS = 6.0
 """Standard deviations from zero beyond which a fault is reported."""
 
-CONSIDERED_SIGMAS = 4.0
-"""Standard deviations from zero beyond which a fault is allowed for: to be wrong costs certainty only."""
+CONSIDERED_SIGMAS = 3.0
+"""Standard deviations from zero beyond which what faults do to an error is allowed for: to be wrong costs certainty
+only."""
 
 LEVER_ARM_ERROR = 0.05
 """m; smaller errors of the lever arm are not reported."""
 
 TIME_ERROR = 0.01
 """s; smaller time offsets are not reported."""
+
+SCALE_ERROR = 0.003
+"""Smaller scale errors of the gyros are not reported."""
+
+DRIFT_ERROR = 2e-6
+"""rad/s2 (0.4 deg/s in an hour); smaller drifts of the gyro bias are not reported."""
+
+LEAST_FAULT = (LEVER_ARM_ERROR, LEVER_ARM_ERROR, LEVER_ARM_ERROR, TIME_ERROR, TIME_ERROR, SCALE_ERROR, DRIFT_ERROR)
+"""Faults that are not reported (m, m, m, s, s, 1, rad/s2)."""
 
 LEAKAGE = 0.3
 """Share of the significance of the most certain fault above which another is certain, too."""
@@ -88,8 +107,11 @@ INSTALLATION = np.dtype(
         ("checked", "i8"),
         ("estimate", "f8", (SOURCES, FAULTS)),
         ("found", "f8", (SOURCES, FAULTS)),
+        ("covariance", "f8", (SOURCES, FAULTS, FAULTS)),
         ("sigma", "f8", (SOURCES, FAULTS)),
         ("held", "i8", (SOURCES, FAULTS)),
+        ("is_considered", "i8", (SOURCES,)),
+        ("considered", "f8", (SOURCES, ERROR_SIZE)),
     ],
     align=True,
 )
@@ -99,16 +121,18 @@ INSTALLATION = np.dtype(
 - ``absorbed``: derivative of the errors, augmented states included, by the faults.
 - ``information``, ``evidence``: normal equations of the faults.
 - ``checked``: when they were solved last (ns).
-- ``estimate``, ``sigma``: the faults, true minus configured, and their standard deviations.
+- ``estimate``, ``covariance``, ``sigma``: the faults, true minus configured, their covariance and standard deviations.
 - ``found``: those that are certain, else 0; ``held``: for how many looks in a row they have been so.
+- ``is_considered``, ``considered``: whether faults have an effect on the 15 errors of the core that is not chance, and
+  that effect: `update_considered`.
 """
 
 
 @njit
 def write_effect(state, aid, work, settings):
-    """Write the derivative of a measurement by the faults of its receiver to ``work.effect`` (3, 5).
+    """Write the derivative of a measurement by the faults of its receiver to ``work.effect`` (3, 7).
 
-    It is zero for all streams but GNSS position and velocity.
+    It is zero for all streams but GNSS position and velocity, and for the faults of the gyros, which act in time.
     """
     effect = work.effect
     for i in range(3):
@@ -185,6 +209,7 @@ def learn_faults(state, aid, size, gate, work, settings):
         state.installation.evidence.fill(0.0)
         state.installation.found.fill(0.0)
         state.installation.estimate.fill(0.0)
+        state.installation.is_considered.fill(0)
         return
     if state.installation.stamp == NEVER:
         absorb_completely(state, settings)
@@ -208,6 +233,31 @@ def learn_faults(state, aid, size, gate, work, settings):
                 for k in range(FAULTS):
                     for a in range(size):
                         absorbed[i, k] += work.gain[i, a] * effect[a, k]
+        update_considered(state, source)
+
+
+@njit
+def update_considered(state, source):
+    """Update what the faults of a receiver, as they are estimated, do to the errors of the core.
+
+    The estimate is not corrected by it: it is held in the covariance that is published, as the effect of consider
+    parameters (Schmidt, 1966; Tapley, Schutz and Born, Statistical Orbit Determination, section 6.5). Two faults that
+    cannot be told apart yet have one effect, which is certain sooner than either of them.
+    """
+    installation = state.installation
+    absorbed, estimate = installation.absorbed[source], installation.estimate[source]
+    covariance = installation.covariance[source]
+    installation.is_considered[source] = 0
+    for i in range(ERROR_SIZE):
+        effect, variance = 0.0, 0.0
+        for k in range(FAULTS):
+            effect += absorbed[i, k] * estimate[k]
+            for m in range(FAULTS):
+                variance += absorbed[i, k] * covariance[k, m] * absorbed[i, m]
+        is_certain = effect * effect > CONSIDERED_SIGMAS**2 * variance
+        installation.considered[source, i] = effect if is_certain else 0.0
+        if is_certain:
+            installation.is_considered[source] = 1
 
 
 @njit
@@ -233,8 +283,13 @@ def carry_absorbed(state, settings):
     dt = 0.0 if state.installation.stamp == NEVER else (state.stamp - state.installation.stamp) * 1e-9
     last = state.installation.force
     mean = (0.5 * (force[0] + last[0]), 0.5 * (force[1] + last[1]), 0.5 * (force[2] + last[2]))
+    rate = rotate(rotation, smoothed_rate(state, rotation))
     for source in range(SOURCES):
         a = state.installation.absorbed[source]
+        # What the gyros read too much turns the attitude too far; a bias that drifts leaves its estimate behind.
+        for i in range(3):
+            a[ATTITUDE + i, GYRO_SCALE] += dt * rate[i]
+            a[GYRO_BIAS + i, GYRO_DRIFT] -= dt * rotation[2][i]
         for k in range(FAULTS):
             turning = rotate(rotation, (a[GYRO_BIAS, k], a[GYRO_BIAS + 1, k], a[GYRO_BIAS + 2, k]))
             pulling = rotate(rotation, (a[ACCEL_BIAS, k], a[ACCEL_BIAS + 1, k], a[ACCEL_BIAS + 2, k]))
@@ -306,11 +361,12 @@ def find_faults(state, work):
             state.installation.estimate[source, k] = state.installation.found[source, k] = estimate
             widening = excess if k == VELOCITY_TIME else excess + together
             state.installation.sigma[source, k] = math.sqrt(covariance[k, k] * widening)
+            for m in range(FAULTS):
+                state.installation.covariance[source, k, m] = covariance[k, m] * (excess + together)
             largest = max(largest, abs(estimate) / state.installation.sigma[source, k])
         for k in range(FAULTS):
-            least = TIME_ERROR if k >= POSITION_TIME else LEVER_ARM_ERROR
             estimate, sigma = state.installation.found[source, k], state.installation.sigma[source, k]
-            is_small = abs(estimate) < max(FAULT_SIGMAS, LEAKAGE * largest) * sigma or abs(estimate) < least
+            is_small = abs(estimate) < max(FAULT_SIGMAS, LEAKAGE * largest) * sigma or abs(estimate) < LEAST_FAULT[k]
             if is_small or abs(estimate) > LARGEST_FAULT * FAULT_PRIOR[k]:
                 state.installation.found[source, k] = 0.0
             is_certain = state.installation.found[source, k] != 0.0
@@ -326,24 +382,3 @@ def fixes_together(state, source):
     """
     interval = max(1e-9 * state.recovery.absolute_interval, LEAST_INTERVAL)
     return 2.0 * LASTING_TIME / interval * state.scatter.calm[source]
-
-
-@njit
-def considered_fault(state, source, fault):
-    """Return the size of a fault that is likely, 0 for others.
-
-    The estimate is not corrected by it. Its effect (``absorbed``) is held in the covariance that is published, as that
-    of a consider parameter (Schmidt, 1966; Tapley, Schutz and Born, Statistical Orbit Determination, section 6.5).
-    """
-    size, sigma = state.installation.estimate[source, fault], state.installation.sigma[source, fault]
-    return size if CONSIDERED_SIGMAS * sigma < abs(size) < LARGEST_FAULT * FAULT_PRIOR[fault] else 0.0
-
-
-@njit
-def considered_variance(state, axis):
-    """Return the variance (m2) of the position on an axis of map that comes from faults that are considered."""
-    total = 0.0
-    for source in range(SOURCES):
-        for k in range(FAULTS):
-            total += (considered_fault(state, source, k) * state.installation.absorbed[source, POSITION + axis, k]) ** 2
-    return total

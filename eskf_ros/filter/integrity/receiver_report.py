@@ -7,7 +7,13 @@ import math
 import numpy as np
 from scipy.special import chdtri
 
-from eskf_ros.filter.integrity.installation_monitor import LASTING_LOOKS, POSITION_TIME, VELOCITY_TIME
+from eskf_ros.filter.integrity.installation_monitor import (
+    GYRO_DRIFT,
+    GYRO_SCALE,
+    LASTING_LOOKS,
+    POSITION_TIME,
+    VELOCITY_TIME,
+)
 from eskf_ros.filter.integrity.motion_report import has_compared
 from eskf_ros.filter.integrity.receiver_monitor import (
     FEW_DEPARTURES,
@@ -103,6 +109,19 @@ def _fault_complaints(state: np.void, settings: np.void, source: int, is_doubtfu
             f"the antenna{_of(source)} seems to be ({x:+.2f}, {y:+.2f}, {z:+.2f}) m "
             f"(+- {sigma[:POSITION_TIME][arm != 0.0].max():.2f}) in base_link from where {group}.lever_arm says: "
             "measure it again"
+        )
+    scale = float(found[GYRO_SCALE])
+    if scale and source == 0:
+        texts.append(
+            f"in turns the gyros read {abs(scale) * 100.0:.2f} % (+- {sigma[GYRO_SCALE] * 100.0:.2f}) too "
+            f"{'much' if scale > 0.0 else 'little'}: calibrate imu.gyro_scale, or let estimate.imu_scale find it"
+        )
+    drift = float(found[GYRO_DRIFT])
+    if drift and source == 0:
+        texts.append(
+            f"the gyro bias about the vertical drifts by {math.degrees(abs(drift)) * 60.0:.3f} deg/s a minute "
+            f"(+- {math.degrees(sigma[GYRO_DRIFT]) * 60.0:.3f}): let the IMU warm up, or raise "
+            "imu.gyro_bias_random_walk"
         )
     return texts
 

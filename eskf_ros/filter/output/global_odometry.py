@@ -10,7 +10,6 @@ from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.levelling import UNKNOWN_SPEED
 from eskf_ros.filter.inertial.navigation_frame import body_rate, heading_of
 from eskf_ros.filter.integrity.fix_errors import held_variance
-from eskf_ros.filter.integrity.installation_monitor import FAULTS, considered_fault
 from eskf_ros.filter.output.status import quality_of, status_of
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, GYRO_BIAS, POSITION, SOURCES, VELOCITY
 from eskf_ros.geodesy.rotation import cross, from_matrix, from_rotation_vector, multiply, rotate, rotate_back, to_matrix
@@ -107,9 +106,8 @@ def write_odometry(state, local, settings, row):
     write_pose_covariance(state, imu_offset, row)
     write_twist_covariance(state, base_to_map, settings, row)
     for source in range(SOURCES):
-        for fault in range(FAULTS):
-            if considered_fault(state, source, fault) != 0.0:
-                add_considered_fault(state, source, fault, imu_offset, base_to_map, row)
+        if state.installation.is_considered[source] == 1:
+            add_considered_faults(state, source, imu_offset, base_to_map, row)
     lag = state.motion.turns.lag
     for i in range(3):
         for j in range(3):
@@ -204,29 +202,27 @@ def write_twist_covariance(state, base_to_map, settings, row):
 
 
 @njit
-def add_considered_fault(state, source, fault, imu_offset, base_to_map, row):
-    """Add what a fault of the installation, as large as it was found, does to pose and velocity of base_link."""
-    size, effect = considered_fault(state, source, fault), state.installation.absorbed[source]
-    turn = (effect[ATTITUDE, fault], effect[ATTITUDE + 1, fault], effect[ATTITUDE + 2, fault])
+def add_considered_faults(state, source, imu_offset, base_to_map, row):
+    """Add what faults of the installation do to pose and velocity of base_link, as large as they were found."""
+    effect = state.installation.considered[source]
+    turn = (effect[ATTITUDE], effect[ATTITUDE + 1], effect[ATTITUDE + 2])
     velocity = (state.velocity_map[0], state.velocity_map[1], state.velocity_map[2])
     moved, sped = cross(imu_offset, turn), cross(velocity, turn)
-    speed = (
-        effect[VELOCITY, fault] + sped[0],
-        effect[VELOCITY + 1, fault] + sped[1],
-        effect[VELOCITY + 2, fault] + sped[2],
+    forward = rotate_back(
+        base_to_map,
+        (effect[VELOCITY] + sped[0], effect[VELOCITY + 1] + sped[1], effect[VELOCITY + 2] + sped[2]),
     )
-    forward = rotate_back(base_to_map, speed)
     pose = (
-        effect[POSITION, fault] + moved[0],
-        effect[POSITION + 1, fault] + moved[1],
-        effect[POSITION + 2, fault] + moved[2],
+        effect[POSITION] + moved[0],
+        effect[POSITION + 1] + moved[1],
+        effect[POSITION + 2] + moved[2],
         turn[0],
         turn[1],
         turn[2],
     )
     for i in range(6):
         for j in range(6):
-            row.pose_covariance[i, j] += size * size * pose[i] * pose[j]
+            row.pose_covariance[i, j] += pose[i] * pose[j]
     for i in range(3):
         for j in range(3):
-            row.twist_covariance[i, j] += size * size * forward[i] * forward[j]
+            row.twist_covariance[i, j] += forward[i] * forward[j]

@@ -12,9 +12,8 @@ import math
 from eskf_ros.compiled import njit
 from eskf_ros.filter.integrity.fix_errors import held_variance
 from eskf_ros.filter.integrity.heading_monitor import has_lasting_difference
-from eskf_ros.filter.integrity.installation_monitor import considered_variance
 from eskf_ros.filter.state.enums import Quality, Status
-from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, POSITION
+from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, POSITION, SOURCES
 from eskf_ros.filter.state.time import NEVER
 
 SHORTEST_COAST = 1_000_000_000
@@ -84,10 +83,11 @@ def quality_of(state, status, settings):
         return Quality.COASTED_TOO_LONG
     variance = 0.0
     for i in range(2):
-        variance += (
-            state.covariance[POSITION + i, POSITION + i] + held_variance(state, i) + considered_variance(state, i)
-        )
+        variance += state.covariance[POSITION + i, POSITION + i] + held_variance(state, i)
         variance += (state.motion.turns.lag * state.velocity_map[i]) ** 2
+        for source in range(SOURCES):
+            if state.installation.is_considered[source] == 1:
+                variance += state.installation.considered[source, POSITION + i] ** 2
     if variance > settings.quality_position_std**2:
         return Quality.TOO_UNCERTAIN
     return Quality.COASTING if status == Status.COASTING else Quality.GOOD
