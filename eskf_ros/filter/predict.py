@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.alignment.heading_search import predict_search
+from eskf_ros.filter.alignment.heading_search import forget_search, predict_search
 from eskf_ros.filter.inertial.covariance import (
     credible_force,
     propagate_axis_noise,
@@ -61,7 +61,11 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
         carry_transition(state, middle, force, gravity, dt, coupling, settings)
     propagate_noise(covariance, velocity_noise, attitude_noise, accel_walk, gyro_walk, dt)
     if state.quality.is_doubted == 1:
-        propagate_axis_noise(covariance, middle, state.quality.doubt, dt)
+        doubt = state.quality.doubt
+        propagate_axis_noise(covariance, middle, doubt, dt)
+        if state.heading_known == 0 and max(doubt[3], max(doubt[4], doubt[5])) > 0.0:
+            # The search compares headings by turns that were not measured.
+            forget_search(state)
     if size > ERROR_SIZE:
         augmented_states.propagate_augmented(state, dt, settings)
 

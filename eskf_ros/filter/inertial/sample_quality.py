@@ -121,6 +121,9 @@ LASTS = 2.0
 STANDING = 0.3
 """m/s; at a smaller estimated speed the robot may stand, and a reading may stay the same."""
 
+SEEN_LATELY = 3_000_000_000
+"""ns; for so long a robot that another sensor has seen moving is thought to move."""
+
 LEAST_FORCE_JUMP = 10.0
 """m/s2; a smaller change from one sample to the next is no shock."""
 
@@ -342,9 +345,11 @@ def is_usual(quality, share, usual, count):
 
 @njit
 def is_standing(state):
-    """Say whether the robot is estimated to stand, or not to have moved yet."""
+    """Say whether the robot is estimated to stand, or has not been seen to move while its heading is unknown."""
+    if state.heading_known == 0:
+        return state.window.motion_stamp == NEVER or state.stamp - state.window.motion_stamp > SEEN_LATELY
     v = state.velocity_map
-    return state.heading_known == 0 or v[0] * v[0] + v[1] * v[1] + v[2] * v[2] < STANDING * STANDING
+    return v[0] * v[0] + v[1] * v[1] + v[2] * v[2] < STANDING * STANDING
 
 
 @njit

@@ -46,6 +46,9 @@ from eskf_ros.filter.state.lanes import FILTER, HUMBLE, is_running
 from eskf_ros.filter.state.streams import is_live
 from eskf_ros.filter.state.time import NEVER
 
+LOST_HEADING_STD = 0.95
+"""rad; a heading that is known no better is unknown."""
+
 SAME_SOLUTION = 4.0
 """Largest ratio of the variances of two consecutive fixes of the same kind of solution."""
 
@@ -71,6 +74,13 @@ def reset_for_new_solution(states, aid, settings, work):
 def fuse_receiver(states, aid, gate, settings, work):
     """Fuse or refuse a position or velocity of GNSS; ``gate`` is the innovation gate of the filter (NIS)."""
     state, humble = states[FILTER], states[HUMBLE]
+    if (
+        state.heading_known == 1
+        and state.covariance[HEADING, HEADING] > LOST_HEADING_STD**2
+        and state.heading.given_stamp == NEVER
+    ):
+        # A gyro that did not measure has left no heading that a linear filter could correct: it is searched for.
+        reset_to_unknown_heading(state)
     start(states, settings)
     is_position = aid.stream == Stream.GNSS_POSITION
     if is_position:
