@@ -18,6 +18,7 @@ from eskf_ros.filter.integrity.receiver import fuse_receiver, reset_for_new_solu
 from eskf_ros.filter.integrity.receiver_monitor import watch_receiver
 from eskf_ros.filter.integrity.recovery import note, recover
 from eskf_ros.filter.integrity.repeated_fixes import is_repeated, note_copy, note_fused_fix
+from eskf_ros.filter.integrity.restart import reset_alignment
 from eskf_ros.filter.measurements import (
     baro,
     body_velocity,
@@ -70,9 +71,13 @@ def fuse(states, aids, i, settings, work):
         return
     if aid.stream == Stream.GNSS_POSITION:
         gnss_position.fill_altitude(state, aid.payload, aid.source, settings)
-    if state.level_known == 1:
-        # What came before the first sample that counts must leave no trace, and no window may begin with it.
-        watch_motion(state, aid, settings)
+    # What came before the first sample that counts must leave no trace, and no window may begin with it.
+    if state.level_known == 1 and watch_motion(state, aid, settings):
+        # The filter has followed velocities in other axes.
+        reset_alignment(state)
+    if aid.stream == Stream.GNSS_VELOCITY and aid.source == 0 and state.motion.has_other_axes == 1:
+        aid.verdict = Verdict.CONTRADICTED
+        return
     update_motion_evidence(state, aid, settings)
     if aid.stream == Stream.GNSS_POSITION and state.level_known == 1 and state.position_known == 0:
         begin(state, aid, settings)

@@ -38,6 +38,7 @@ MOTION = np.dtype(
         ("start_fix", "f8", (3,)),
         ("start_way", "f8", (2,)),
         ("axes", "f8", (3,)),
+        ("has_other_axes", "i8"),
         ("last_stamp", "i8"),
         ("last_velocity", "f8", (2,)),
         ("last_turned", "f8", (3,)),
@@ -64,7 +65,7 @@ MOTION = np.dtype(
 - ``jumps``, ``jump``: how often fixes jumped, and the furthest (m).
 - ``start_stamp``, ``start_fix``, ``start_way``: a window of positions, and the integral of the velocities over it.
 - ``axes``: sums of the squares (m2) by which velocities differ from the changes of positions, as they are and with east
-  and north exchanged, and the number of windows.
+  and north exchanged, and the number of windows. ``has_other_axes``: they are exchanged.
 - ``last_*``: velocity at the end of the window before (positions alone: in its middle), and the integrals over it.
   Where velocities come, windows begin and end with them.
 - ``turns``, ``pushes``: the comparisons.
@@ -100,6 +101,15 @@ LEAST_PAUSE = 0.3
 PAUSE_SIGMAS = 4.0
 """Standard deviations of the difference of two fixes by which the way during a pause must be too short."""
 
+FEWEST_WAYS = 8
+"""Windows from which on the ways by positions and by velocities are compared."""
+
+OTHER_WAY = 20.0
+"""m2; mean square of their difference from which on the axes of the velocities are asked for."""
+
+BETTER = 10.0
+"""Ratio of the squares by which exchanged axes must fit better."""
+
 SAME_VELOCITY = 0.3
 """Share by which the velocity may have changed over a pause that was none."""
 
@@ -126,13 +136,18 @@ def forget_window(motion):
 
 @njit
 def watch_motion(state, aid, settings):
-    """Compare a position or velocity of the first receiver with those before it and with the IMU."""
+    """Compare a position or velocity of the first receiver with those before it and with the IMU.
+
+    Returns whether it shows that the velocities so far have had other axes than the positions.
+    """
     if aid.source != 0:
-        return
+        return False
+    knew = state.motion.has_other_axes == 1
     if aid.stream == Stream.GNSS_VELOCITY:
         watch_velocity(state, aid, settings)
     elif aid.stream == Stream.GNSS_POSITION:
         watch_position(state, aid, settings)
+    return state.motion.has_other_axes == 1 and not knew
 
 
 @njit
@@ -346,3 +361,6 @@ def compare_axes(motion, change):
     motion.axes[0] += (change[0] - way[0]) ** 2 + (change[1] - way[1]) ** 2
     motion.axes[1] += (change[0] - way[1]) ** 2 + (change[1] - way[0]) ** 2
     motion.axes[2] += 1.0
+    own, exchanged, ways = motion.axes[0], motion.axes[1], motion.axes[2]
+    is_other = ways > FEWEST_WAYS and own > OTHER_WAY * ways and own > BETTER * exchanged
+    motion.has_other_axes = 1 if is_other else 0

@@ -32,15 +32,6 @@ MIRRORED = -0.5
 NOTABLE_YAW, YAW_SIGMAS = math.radians(3.0), 3.5
 """rad and standard deviations from which on a direction of travel is told."""
 
-FEWEST_WAYS = 8
-"""Windows from which on the ways by positions and by velocities are compared."""
-
-OTHER_WAY = 20.0
-"""m2; mean square of their difference from which on the axes of the velocities are asked for."""
-
-BETTER = 10.0
-"""Ratio of the squares by which exchanged axes must fit better."""
-
 
 def motion_complaints(state: np.void) -> list[str]:
     """Return one sentence for each fault of axes and clocks that receiver and IMU show without the filter."""
@@ -52,13 +43,12 @@ def motion_complaints(state: np.void) -> list[str]:
             f"{int(motion['clock_stamp']) * 1e-9:.1f} ({int(motion['clock_steps'])} times): the stamps of IMU and "
             "fixes went ahead, and the robot did not; let the clock be slewed, or set it before the drive"
         )
-    own, exchanged, ways = (float(value) for value in motion["axes"])
-    if ways > FEWEST_WAYS and own > OTHER_WAY * ways and own > BETTER * exchanged:
+    if motion["has_other_axes"]:
         # With such velocities the course says nothing of the IMU.
         return [
             *found,
             "the velocities of the receiver fit its positions with east and north exchanged: they seem to be in "
-            "North-East-Down axes; publish East-North-Up (REP-103)",
+            "North-East-Down axes, and are not used; publish East-North-Up (REP-103)",
         ]
     return found + _turn_complaints(motion["turns"]) + _push_complaints(motion["pushes"])
 

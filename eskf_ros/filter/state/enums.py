@@ -75,12 +75,13 @@ class Phase(IntEnum):
 class Verdict(IntEnum):
     """What became of an offered measurement (a closed list; files show the names in lower case).
 
-    GATE: outside the innovation gate. WEIGHED_DOWN: fused with inflated noise. INACTIVE: the measurement says nothing
-    at the moment, such as a ZUPT in motion; it leaves no record. CONTRADICTED: a position that moves otherwise than the
-    velocity of the same receiver. RESET: the last of several rejected measurements that agree with each other; the
-    filter was reset to them. TAKEOVER: fused, and the filter continues from the humble lane, which predicted it better.
-    UNFILLED: a fix at latitude and longitude zero, which nobody has filled in. REPEATED: the coordinates of an earlier
-    fix, bit for bit, with a fresh stamp.
+    GATE: outside the innovation gate. WEIGHED_DOWN: fused with inflated noise. INACTIVE: the measurement says
+    nothing at the moment, such as a ZUPT in motion; it leaves no record. CONTRADICTED: a position that moves
+    otherwise than the velocity of the same receiver, or velocities in other axes than its positions. RESET: the
+    last of several rejected measurements that agree with each other; the filter was reset to them. TAKEOVER: fused,
+    and the filter continues from the humble lane, which predicted it better. UNFILLED: a fix at latitude and
+    longitude zero, which nobody has filled in. REPEATED: the coordinates of an earlier fix, bit for bit, with a
+    fresh stamp.
     """
 
     WAITING = 0
