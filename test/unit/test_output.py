@@ -147,6 +147,35 @@ def test_twist_covariance_of_an_imu_off_the_origin(seed: int) -> None:
 
 
 @seeds
+def test_what_faults_of_the_installation_do_is_published_as_if_the_state_had_that_error(seed: int) -> None:
+    """One vector d of errors adds d d' to the covariance of the core."""
+    state, other = running(seed), running(seed)
+    effect = np.random.default_rng(seed).normal(size=15) * np.sqrt(np.diag(core(state)))
+    effect[9:] = 0.0
+    core(other)[:] += np.outer(effect, effect)
+    state["installation"]["considered"][1] = effect
+    before = published(state, MOUNTED)
+    state["installation"]["is_considered"][1] = 1
+    row, expected = published(state, MOUNTED), published(other, MOUNTED)
+    assert not np.allclose(before["pose_covariance"], row["pose_covariance"])
+    for name in ("pose_covariance", "twist_covariance"):
+        np.testing.assert_allclose(row[name][:3, :3], expected[name][:3, :3], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(row["pose_covariance"], expected["pose_covariance"], rtol=1e-9, atol=1e-12)
+
+
+@seeds
+def test_clocks_that_are_apart_leave_the_way_of_that_time_unknown(seed: int) -> None:
+    state = running(seed)
+    before = published(state, MOUNTED)
+    state["motion"]["turns"]["lag"] = 1.2
+    row = published(state, MOUNTED)
+    way = 1.2 * row["velocity_map"]
+    added = row["pose_covariance"] - before["pose_covariance"]
+    np.testing.assert_allclose(added[:3, :3], np.outer(way, way), rtol=1e-9, atol=1e-9)
+    assert not added[3:].any()
+
+
+@seeds
 def test_biases_are_in_imu_axes(seed: int) -> None:
     state = running(seed)
     row = published(state, MOUNTED)

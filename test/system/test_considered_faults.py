@@ -1,0 +1,118 @@
+"""Faults of the installation: how the estimate follows them, how they are found, and what is published of them."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from campaign.fault import DEFAULT_POSITION, DEFAULT_VELOCITY, TOLD_POSITION, TOLD_VELOCITY, Filter
+from campaign.judge import figures_of
+from campaign.running import recording_of, run_one
+from eskf_ros.filter.integrity.installation_monitor import FAULTS, GYRO_DRIFT, GYRO_SCALE, POSITION_TIME, VELOCITY_TIME
+from eskf_ros.filter.navigator import Navigator
+from eskf_ros.parameters.mapping import from_mapping
+from eskf_ros.simulate.scenario import Recording, simulate
+from faults import all_faults
+from monte_carlo import feed
+
+Array = NDArray[np.float64]
+SECONDS = 70.0
+SIZES = {0: 0.02, 1: 0.02, POSITION_TIME: 0.002, VELOCITY_TIME: 0.002, GYRO_SCALE: 1e-4, GYRO_DRIFT: 1e-7}
+"""Of each fault, small enough to be linear (m, m, s, s, 1, rad/s2)."""
+BY_NAME = {fault.name: fault for fault in all_faults()}
+
+
+@lru_cache
+def drive() -> Recording:
+    """A drive whose heading is given: nothing is searched for."""
+    return simulate("drive", seed=5, imu_rate=100.0, gnss_rate=2.0, stop=SECONDS, start=10.0)
+
+
+def estimate(recording: Recording, **changes: Any) -> tuple[Array, Array]:
+    """Return position (m) and velocity (m/s) at the end, (6,), and their derivatives by the faults, (6, faults)."""
+    parameters = {
+        **recording.parameters(),
+        "alignment.initial_heading_deg": float(np.degrees(initial_heading(recording))),
+        "alignment.initial_heading_std_deg": 1.0,
+        **changes,
+    }
+    navigator = Navigator(from_mapping(parameters))
+    state = next(iter(feed(recording, navigator, np.array([len(recording.imu_stamp) - 1]))))[1].copy()
+    values = np.concatenate([state["position_map"], state["velocity_map"]])
+    effect = np.array(state["installation"]["absorbed"][0, :6])
+    # It is that at the last message.
+    effect[:3] += (state["stamp"] - state["installation"]["stamp"]) * 1e-9 * effect[3:]
+    return values, effect
+
+
+def initial_heading(recording: Recording) -> float:
+    w, x, y, z = recording.truth_attitude_body_to_map[0]
+    return float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+
+
+def broken(recording: Recording, fault: int, size: float) -> tuple[Recording, dict[str, Any]]:
+    """The recording, or the parameters, with one fault of a ``size``: true minus configured."""
+    changes: dict[str, Any] = {}
+    if fault < POSITION_TIME:
+        arm = list(recording.parameters()["gnss.lever_arm"])
+        arm[fault] -= size
+        changes["gnss.lever_arm"] = arm
+    elif fault == POSITION_TIME:
+        changes["gnss.time_offset"] = -size
+        changes["gnss.velocity_time_offset"] = size
+    elif fault == VELOCITY_TIME:
+        changes["gnss.velocity_time_offset"] = -size
+    elif fault == GYRO_SCALE:
+        recording = dataclasses.replace(recording, angular_rate=recording.angular_rate * (1.0 + size))
+    else:
+        seconds = (recording.imu_stamp - recording.imu_stamp[0]) * 1e-9
+        drifted = recording.angular_rate + np.array([0.0, 0.0, size]) * seconds[:, None]
+        recording = dataclasses.replace(recording, angular_rate=drifted)
+    return recording, changes
+
+
+@pytest.mark.parametrize("fault", SIZES)
+def test_the_estimate_follows_a_fault_as_the_monitor_says(fault: int) -> None:
+    """Position and velocity with the fault minus without it, against its sensitivity (Friedland)."""
+    before, absorbed = estimate(drive())
+    size = SIZES[fault]
+    recording, changes = broken(drive(), fault, size)
+    after, _ = estimate(recording, **changes)
+    expected = absorbed[:, fault] * size
+    scale = np.abs(expected).max()
+    assert scale > 0.0
+    # Accelerations that may be tilt or bias are left out of the time of velocities on purpose.
+    tolerance = 0.35 if fault == VELOCITY_TIME else 0.25
+    np.testing.assert_allclose(after - before, expected, rtol=0.0, atol=tolerance * scale)
+
+
+@pytest.mark.parametrize(
+    ("name", "given"),
+    [
+        ("lever arm 1.5 m off in x", TOLD_VELOCITY),
+        ("lever arm 1.5 m off in y", DEFAULT_VELOCITY),
+        ("positions stamped 0.25 s late", TOLD_VELOCITY),
+        ("positions stamped 0.25 s late", DEFAULT_POSITION),
+        ("velocities stamped 0.13 s late", TOLD_VELOCITY),
+        ("scale 1.5 %", TOLD_POSITION),
+        ("clocks of IMU and receiver 1.2 s apart", TOLD_VELOCITY),
+    ],
+)
+def test_what_is_found_is_in_the_published_covariance(name: str, given: Filter) -> None:
+    """From two minutes on position and heading are within 5 standard deviations (bar 2 of docs/trust.md)."""
+    fault = BY_NAME[name]
+    figures = figures_of(fault, run_one(fault, recording_of(fault, 2), given))
+    assert figures.position_lies <= 0.01
+    assert figures.heading_lies <= 0.01
+
+
+def test_a_clean_drive_considers_nothing() -> None:
+    navigator = Navigator(from_mapping(drive().parameters()))
+    for _, state in feed(drive(), navigator, np.arange(100, len(drive().imu_stamp), 100)):
+        assert not state["installation"]["is_considered"].any()
+        assert state["installation"]["estimate"].shape[1] == FAULTS
