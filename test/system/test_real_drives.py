@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from support.recordings.car_ontario import DRIVES, car_ontario_recording
 from support.recordings.common import Recording, replayed
 from support.recordings.drive_0708 import OUTAGE_SETS, drive_0708_recording
 from support.recordings.husky import husky_recording
@@ -267,3 +269,20 @@ def test_nagoya_with_real_fixes(tmp_path: Path, data_folder: Callable[[str], Pat
     assert summary["truth"]["compared"] > 5600
     assert_within(summary, "horizontal", p50=1.86, p95=10.3, max=53.1)
     assert_within(summary, "vertical", p50=1.4, p95=21.0)
+
+
+@pytest.mark.parametrize("drive", DRIVES)
+def test_car_ontario_with_default_parameters(tmp_path: Path, data_folder: Callable[[str], Path], drive: str) -> None:
+    """Noise by default, the IMU turned any way: a wrong mounting is found, and nothing is lost or blamed wrongly."""
+    recording = car_ontario_recording(tmp_path, data_folder("car_ontario"), drive)
+    mounted = replayed(recording, chosen_noise=False)
+    untold = replayed(replace(recording, installation="/**:\n  ros__parameters:\n    mode: loose\n"))
+    for summary in (mounted, untold):
+        assert (summary["position_resets"], summary["restarts"]) == (0, 0)
+        assert summary["error"]["horizontal"]["p95"] < 1.5
+    turned = (
+        "at rest gravity is|by its accelerations the robot travels|about the vertical|accelerations along the course"
+    )
+    for summary, right in ((mounted, "none"), (untold, turned)):
+        wrong = [text for text in summary["warnings"] if "their errors last" not in text and not re.match(right, text)]
+        assert wrong == []
