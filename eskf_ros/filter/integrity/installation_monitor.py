@@ -204,12 +204,7 @@ def learn_faults(state, aid, size, gate, work, settings):
         if aid.verdict == Verdict.TAKEOVER:
             # A wrong lever arm or time offset may be why the filter seemed wrong: the evidence stays.
             return
-        # What was learnt from an estimate that was wrong goes with it.
-        state.installation.information.fill(0.0)
-        state.installation.evidence.fill(0.0)
-        state.installation.found.fill(0.0)
-        state.installation.estimate.fill(0.0)
-        state.installation.is_considered.fill(0)
+        forget_faults(state)
         return
     if state.installation.stamp == NEVER:
         absorb_completely(state, settings)
@@ -234,6 +229,17 @@ def learn_faults(state, aid, size, gate, work, settings):
                     for a in range(size):
                         absorbed[i, k] += work.gain[i, a] * effect[a, k]
         update_considered(state, source)
+
+
+@njit
+def forget_faults(state):
+    """Forget what was learnt of the faults from an estimate that was wrong."""
+    state.installation.stamp = NEVER
+    state.installation.information.fill(0.0)
+    state.installation.evidence.fill(0.0)
+    state.installation.found.fill(0.0)
+    state.installation.estimate.fill(0.0)
+    state.installation.is_considered.fill(0)
 
 
 @njit

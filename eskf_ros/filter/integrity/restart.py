@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.heading_search import forget_search
+from eskf_ros.filter.integrity.installation_monitor import forget_faults
 from eskf_ros.filter.state.time import NEVER
 
 
@@ -22,11 +23,7 @@ def reset_alignment(state):
     state.window.start = NEVER
     state.window.still_stamp = NEVER
     state.window.still_samples = 0
-    # The faults of the receivers were learnt with an attitude that is not trusted any more.
-    state.installation.stamp = NEVER
-    state.installation.information.fill(0.0)
-    state.installation.evidence.fill(0.0)
-    state.installation.found.fill(0.0)
+    forget_faults(state)
     for i in range(2):
         state.tight.clock_known[i] = 0
     for i in range(3):

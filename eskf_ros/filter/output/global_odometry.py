@@ -109,9 +109,10 @@ def write_odometry(state, local, settings, row):
         if state.installation.is_considered[source] == 1:
             add_considered_faults(state, source, imu_offset, base_to_map, row)
     lag = state.motion.turns.lag
-    for i in range(3):
-        for j in range(3):
-            row.pose_covariance[i, j] += lag * lag * velocity[i] * velocity[j]
+    if lag != 0.0:
+        for i in range(3):
+            for j in range(3):
+                row.pose_covariance[i, j] += lag * lag * velocity[i] * velocity[j]
 
 
 @njit
