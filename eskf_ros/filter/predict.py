@@ -10,6 +10,7 @@ from eskf_ros.filter.inertial.covariance import (
     propagate_covariance,
     propagate_noise,
 )
+from eskf_ros.filter.inertial.sample_quality import shaken_density
 from eskf_ros.filter.inertial.strapdown import propagate_nominal_state
 from eskf_ros.filter.output.forward_log import carry_transition
 from eskf_ros.filter.state import augmented_states
@@ -54,7 +55,8 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
         predict_search(state, acceleration, middle, dt, settings)
         velocity_noise += WANDER_TIME * (WANDER_ACCELERATION**2 + dot(acceleration, acceleration))
     size, covariance = state.error_size, state.covariance
-    force = credible_force(state.excitation, covariance, middle, force, gravity, dt, settings.accel_noise_density)
+    density = max(settings.accel_noise_density, shaken_density(state.quality, 0, state.imu.interval))
+    force = credible_force(state.excitation, covariance, middle, force, gravity, dt, density)
     augmented_states.propagate_scale(state, middle, force_1, rate_1, dt, coupling, settings)
     propagate_covariance(covariance, size, middle, force, gravity, state.frame.earth_rate_map, dt, coupling, work)
     if settings.keeps_log == 1:

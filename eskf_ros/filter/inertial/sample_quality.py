@@ -139,10 +139,22 @@ LONGEST_SHOCK = 0.5
 
 @njit
 def copy_doubt(state, lane):
-    """Let another lane know which axes of the interval are doubted."""
+    """Let another lane know which axes of the interval are doubted, and how much readings change."""
     lane.quality.is_doubted = state.quality.is_doubted
     for i in range(6):
         lane.quality.doubt[i] = state.quality.doubt[i]
+        lane.quality.change[i] = state.quality.change[i]
+
+
+@njit
+def shaken_density(quality, first, interval):
+    """Return the density of white noise by which the readings of a sensor would change as much as they do.
+
+    Vibration is no noise of the sensor, but says as little of the motion. ``first``: 0 for the accelerometers
+    (m/s2/rtHz), 3 for the gyros (rad/s/rtHz); ``interval`` of the samples in s.
+    """
+    largest = max(quality.change[first], max(quality.change[first + 1], quality.change[first + 2]))
+    return math.sqrt(0.5 * largest * interval)
 
 
 @njit

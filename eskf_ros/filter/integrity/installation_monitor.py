@@ -15,7 +15,8 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.inertial.strapdown import gravity_map
+from eskf_ros.filter.inertial.sample_quality import shaken_density
+from eskf_ros.filter.inertial.strapdown import SMOOTHING_TIME, gravity_map
 from eskf_ros.filter.measurements.kalman_update import invert_positive
 from eskf_ros.filter.state.enums import Stream, Verdict
 from eskf_ros.filter.state.error_state import (
@@ -55,7 +56,7 @@ LEAST_INTERVAL = 0.05
 """s; interval of fixes below which more of them do not say more."""
 
 CERTAIN_SHARE = 2.0
-"""Ratio of the square of an acceleration to its variance below which it says nothing of the time of velocities."""
+"""Ratio of the square of an acceleration or a rate to its variance below which it says nothing of the faults."""
 
 LARGEST_FAULT = 3.0
 """Prior standard deviations; an estimate beyond is no fault of the installation, whatever it is."""
@@ -160,7 +161,7 @@ def write_effect_on_velocity(state, effect):
     """Write the derivative of a velocity by the faults of its receiver to the first rows of ``effect``.
 
     An acceleration that is not larger than what tilt and bias leave unknown of it says nothing: it would be explained
-    by the same errors as the innovation.
+    by the same errors as the innovation. Neither does a rate that is not larger than its own noise and vibration.
     """
     rotation = to_matrix(state.attitude)
     rate = smoothed_rate(state, rotation)
@@ -173,14 +174,21 @@ def write_effect_on_velocity(state, effect):
     )
     for i in range(3):
         unknown += state.covariance[ACCEL_BIAS + i, ACCEL_BIAS + i]
-    square = dot(acceleration, acceleration)
-    share = square / (square + unknown) if square > CERTAIN_SHARE * unknown else 0.0
+    share = certain_share(dot(acceleration, acceleration), unknown)
+    rate_noise = shaken_density(state.quality, 3, state.imu.interval) ** 2 / (2.0 * SMOOTHING_TIME)
+    turning = certain_share(dot(rate, rate), 3.0 * rate_noise)
     x = rotate(rotation, cross(rate, (1.0, 0.0, 0.0)))
     y = rotate(rotation, cross(rate, (0.0, 1.0, 0.0)))
     z = rotate(rotation, cross(rate, (0.0, 0.0, 1.0)))
     for i in range(3):
-        effect[i, 0], effect[i, 1], effect[i, 2] = x[i], y[i], z[i]
+        effect[i, 0], effect[i, 1], effect[i, 2] = turning * x[i], turning * y[i], turning * z[i]
         effect[i, VELOCITY_TIME] = share * acceleration[i]
+
+
+@njit
+def certain_share(square, unknown):
+    """Return the share of a vector, given its square, that is not its own error of a variance ``unknown``."""
+    return square / (square + unknown) if square > CERTAIN_SHARE * unknown else 0.0
 
 
 @njit
