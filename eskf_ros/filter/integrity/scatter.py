@@ -188,7 +188,7 @@ def learn_walk(state, source, settings, work):
     scatter.walk_stamp[source] = state.stamp
     if not is_next:
         scatter.last_change[source] = 0.0
-    elif not is_wide and state.doubt == 0.0:
+    elif not is_wide:
         limit = WALK_CLIP * max(1.0, scatter.change[source])
         gain = max(1.0 / max(scatter.pairs[source], FEWEST_PAIRS), WALK_GAIN)
         scatter.walk[source] += gain * (min(max(walk, -limit), limit) - scatter.walk[source])
