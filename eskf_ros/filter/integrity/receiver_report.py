@@ -7,6 +7,7 @@ import math
 import numpy as np
 from scipy.special import chdtri
 
+from eskf_ros.filter.integrity.heading_monitor import given_heading_complaints
 from eskf_ros.filter.integrity.installation_monitor import LASTING_LOOKS, POSITION_TIME, VELOCITY_TIME
 from eskf_ros.filter.integrity.motion_report import has_compared
 from eskf_ros.filter.integrity.receiver_monitor import (
@@ -57,7 +58,8 @@ def aid_complaints(state: np.void, settings: np.void, is_explained: bool, is_imu
         if is_certain and not is_open and not paths and not faults and not lies:
             found += _velocity_complaints(state, source) + _departure_complaints(state, source)
     if state["recovery"]["resets"]:
-        cause = "" if found or not is_certain else f": multipath for many seconds; or {NOISY_IMU}"
+        is_explained = bool(found or given_heading_complaints(state))
+        cause = "" if is_explained or not is_certain else f": multipath for many seconds; or {NOISY_IMU}"
         found.append(
             f"{int(state['recovery']['resets'])} times fixes that agree with each other contradicted the filter for so "
             f"long that position and velocity were reset to them{cause}"
@@ -167,6 +169,9 @@ def _departure_complaints(state: np.void, source: int) -> list[str]:
     """Return a sentence if a receiver drifted off the path of the IMU, or the humble lane had to take over."""
     departures, stamp = int(state["receiver"]["departures"][source]), int(state["receiver"]["departure_stamp"][source])
     takeovers = int(state["trust"]["takeovers"]) if source == 0 else 0
+    if source == 0 and given_heading_complaints(state):
+        takeovers -= int(state["heading_monitor"]["explained"][0])
+        departures -= int(state["heading_monitor"]["explained"][1])
     if departures < FEW_DEPARTURES and not takeovers:
         return []
     if not departures:
