@@ -127,6 +127,7 @@ def watch_given_heading(state, given_before, turned):
     if abs(monitor.given_off) > wrong_by(monitor.given_std):
         state.installation.information.fill(0.0)
         state.installation.evidence.fill(0.0)
+        state.installation.misfit.fill(0.0)
 
 
 @njit

@@ -26,6 +26,7 @@ def reset_alignment(state):
     state.installation.stamp = NEVER
     state.installation.information.fill(0.0)
     state.installation.evidence.fill(0.0)
+    state.installation.misfit.fill(0.0)
     state.installation.found.fill(0.0)
     for i in range(2):
         state.tight.clock_known[i] = 0
