@@ -31,8 +31,9 @@ LEAST_DELAY, DELAY_SIGMAS, OPEN_SIGMAS = 0.05, 4.0, 2.5
 """s and standard deviations by which positions must be later than the velocities of the same receiver to be told so,
 and from which on they may be: no other cause is told meanwhile."""
 
-CERTAIN_DELAY_STD = 0.1
-"""s; standard deviation of that time above which it is waited for, for `LONGEST_COMPARISON` at most."""
+CERTAIN_DELAY_STD = 0.07
+"""s; standard deviation of that time above which it is waited for before fixes are blamed that move otherwise than the
+velocities, for `LONGEST_COMPARISON` at most."""
 
 NOTABLE_CALM = 0.6
 """Share of the claims that must last for a note."""
@@ -57,18 +58,18 @@ def aid_complaints(state: np.void, settings: np.void, is_explained: bool, is_imu
     for source in range(SOURCES):
         if is_explained or state["receiver"]["fix_count"][source] < MANY_FIXES:
             continue
-        lies = _covariance_complaints(state, source, float(settings["gnss_covariance_scale"]))
         late, std = _delay(state) if source == 0 else (0.0, 0.0)
         is_waiting = std > CERTAIN_DELAY_STD and int(state["stamp"]) - int(state["first_stamp"]) < LONGEST_COMPARISON
-        is_delayed = is_waiting or abs(late) > max(LEAST_DELAY, OPEN_SIGMAS * std)
+        is_delayed = abs(late) > max(LEAST_DELAY, OPEN_SIGMAS * std)
+        scale = float(settings["gnss_covariance_scale"])
+        lies = _covariance_complaints(state, source, scale, is_waiting or is_delayed)
         # Fixes that scatter seem to jump.
         paths = [] if lies else _path_complaints(state, source)
         is_doubtful = is_imu_doubtful or bool(paths) or _departures(state, source) >= FEW_DEPARTURES
         faults = _fault_complaints(state, settings, source, is_doubtful)
-        if is_delayed:
-            # Velocities that are late by the IMU are the cause themselves.
-            is_velocity = state["installation"]["held"][source, VELOCITY_TIME] >= LASTING_LOOKS
-            lies, faults = (faults if is_velocity else _delay_complaints(settings, late, std)), []
+        # Velocities that are late by the IMU are the cause themselves.
+        if is_delayed and state["installation"]["held"][source, VELOCITY_TIME] < LASTING_LOOKS:
+            faults = _delay_complaints(settings, late, std)
         # Those faults explain drifts, contradictions and a high NIS: no sentences of their own.
         found += paths + faults + lies
         # One that is not certain for long may do so, too; or axes of the IMU, which take their time.
@@ -127,11 +128,14 @@ def _fault_complaints(state: np.void, settings: np.void, source: int, is_doubtfu
     return texts
 
 
-def _covariance_complaints(state: np.void, source: int, scale: float) -> list[str]:
+def _covariance_complaints(state: np.void, source: int, scale: float, may_be_late: bool) -> list[str]:
+    """Return a sentence if fixes scatter, or move otherwise than velocities, but if they ``may_be_late``."""
     count, scattered = int(state["receiver"]["fix_count"][source]), int(state["receiver"]["scattered_fixes"][source])
     if scattered > max(MANY_FIXES, count // 10):
         factor = float(state["receiver"]["scatter_sum"][source]) / scattered
         if float(state["scatter"]["change"][source]) < 0.5 * factor:
+            if may_be_late:
+                return []
             return [
                 f"{scattered} of {count} fixes{_of(source)} moved otherwise than the velocities of the same receiver, "
                 f"by {math.sqrt(factor):.1f} times what they claim: multipath or spoofing, or errors that last for "
