@@ -106,7 +106,6 @@ def test_a_fault_is_named_and_no_other(name: str) -> None:
     assert not figures.wrong
 
 
-@pytest.mark.xfail(reason="that receiver and IMU went different ways is said beside the right cause", strict=False)
 @pytest.mark.parametrize(
     ("name", "given", "parameter"),
     [

@@ -35,6 +35,9 @@ CERTAIN_DELAY_STD = 0.07
 """s; standard deviation of that time above which it is waited for before fixes are blamed that move otherwise than the
 velocities, for `LONGEST_COMPARISON` at most."""
 
+CERTAIN_TIME_STD = 0.03
+"""s; standard deviation of the time offset of positions above which takeovers may come from one."""
+
 NOTABLE_CALM = 0.6
 """Share of the claims that must last for a note."""
 
@@ -221,7 +224,9 @@ def _departure_complaints(state: np.void, source: int) -> list[str]:
     takeovers = int(state["trust"]["takeovers"]) if source == 0 else 0
     if source == 0 and given_heading_complaints(state):
         takeovers -= int(state["heading_monitor"]["explained"][0])
-    if departures < FEW_DEPARTURES and not takeovers:
+    is_early = int(state["stamp"]) - int(state["first_stamp"]) < LONGEST_COMPARISON
+    may_be_late = is_early and float(state["installation"]["sigma"][source, POSITION_TIME]) > CERTAIN_TIME_STD
+    if departures < FEW_DEPARTURES and (may_be_late or not takeovers):
         return []
     if not departures:
         stamp = int(state["trust"]["doubt_stamp"])
