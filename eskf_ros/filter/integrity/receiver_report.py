@@ -35,7 +35,7 @@ CERTAIN_DELAY_STD = 0.07
 """s; standard deviation of that time above which it is waited for before fixes are blamed that move otherwise than the
 velocities, for `LONGEST_COMPARISON` at most."""
 
-CERTAIN_TIME_STD = 0.03
+CERTAIN_TIME_STD = 0.02
 """s; standard deviation of the time offset of positions above which takeovers may come from one."""
 
 NOTABLE_CALM = 0.6
