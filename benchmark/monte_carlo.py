@@ -92,12 +92,13 @@ def feed(
     navigator: Navigator,
     stops: NDArray[np.int64],
     messages: Sequence[Message] | None = None,
+    has_arrivals: bool = False,
 ) -> Iterable[tuple[int, np.ndarray]]:
     """Run a recording through a navigator; yield (i, state) right after each of its IMU samples ``stops`` (indices).
 
     The state at a stop has seen what had arrived by then. In between, messages are handed over in bulk: the order
     makes no difference to the state (principle of the timeline) but to the time it takes. ``messages``: those of
-    `messages_of`, or others, in the order of arrival.
+    `messages_of`, or others, in the order of arrival. ``has_arrivals``: the navigator learns when samples came.
     """
     waiting, given, sample = messages_of(recording) if messages is None else messages, 0, 0
     for i in stops:
@@ -107,7 +108,9 @@ def feed(
             push_row(navigator, name, stamp, row, arrival)
             given += 1
         part = slice(sample, i + 1)
-        navigator.push_imu(recording.imu_stamp[part], recording.specific_force[part], recording.angular_rate[part])
+        arrivals = recording.imu_arrival[part] if has_arrivals else None
+        samples = recording.imu_stamp[part], recording.specific_force[part], recording.angular_rate[part]
+        navigator.push_imu(*samples, arrivals=arrivals)
         sample = i + 1
         yield int(i), navigator.state[0]
 

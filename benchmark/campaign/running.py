@@ -177,12 +177,15 @@ def has_order_of_arrival(fault: Fault) -> bool:
 def states_at(
     stops: NDArray[np.int64], recording: Recording, navigator: Navigator, messages: Sequence[Message], in_order: bool
 ) -> Iterator[np.ndarray]:
-    """Yield the state after each of the IMU samples ``stops``; ``in_order``: messages are not handed over in bulk."""
+    """Yield the state after each of the IMU samples ``stops``.
+
+    ``in_order``: messages are not handed over in bulk, and the filter learns when they came, as in node and replay.
+    """
     if not in_order:
         yield from (state for _, state in feed(recording, navigator, stops, messages))
         return
     wanted = set(stops.tolist())
-    for i, state in feed(recording, navigator, np.arange(stops[-1] + 1), messages):
+    for i, state in feed(recording, navigator, np.arange(stops[-1] + 1), messages, has_arrivals=True):
         if i in wanted:
             yield state
 

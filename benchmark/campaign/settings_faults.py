@@ -78,7 +78,7 @@ def settings_faults(amplitude: float = 1.0) -> list[Fault]:
                 given_heading_std_deg=5.0,
                 given_heading_off_deg=wrong,
                 settles=60.0,
-                also=("given heading",),
+                names=("given heading",),
             )
             for wrong in (70.0, 120.0, 180.0)
         ),

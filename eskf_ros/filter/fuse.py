@@ -11,7 +11,7 @@ from eskf_ros.filter.alignment.heading_sensors import update_unknown_heading
 from eskf_ros.filter.alignment.levelling import reset_level_to_moving
 from eskf_ros.filter.history.timeline import open_record
 from eskf_ros.filter.inertial.navigation_frame import heading_of
-from eskf_ros.filter.integrity.heading_monitor import watch_course, watch_field, watch_heading
+from eskf_ros.filter.integrity.heading_monitor import watch_course, watch_field, watch_given_heading, watch_heading
 from eskf_ros.filter.integrity.installation_monitor import find_faults, learn_faults
 from eskf_ros.filter.integrity.motion_monitor import watch_motion
 from eskf_ros.filter.integrity.receiver import fuse_receiver, reset_for_new_solution
@@ -39,6 +39,7 @@ from eskf_ros.filter.state.enums import SENSOR_STREAMS, Stream, Verdict
 from eskf_ros.filter.state.lanes import FILTER
 from eskf_ros.filter.stationarity.detector import update_rest_evidence, watch_rest, watch_wheels
 from eskf_ros.filter.stationarity.static_window import update_evidence_from_fix, update_evidence_from_velocity
+from eskf_ros.geodesy.rotation import wrapped
 
 MEASUREMENTS = (
     gnss_position.ROW,
@@ -82,8 +83,9 @@ def fuse(states, aids, i, settings, work):
     if aid.stream == Stream.GNSS_POSITION and state.level_known == 1 and state.position_known == 0:
         begin(state, aid, settings)
     position_before = (state.position_map[0], state.position_map[1], state.position_map[2])
-    heading_before = heading_of(state, settings)
+    heading_before, given_before = heading_of(state, settings), state.heading.given_stamp
     offer(states, aid, heading_before, settings, work)
+    watch_given_heading(state, given_before, wrapped(heading_of(state, settings) - heading_before))
     note_jump(state, position_before, heading_before, settings)
 
 

@@ -261,6 +261,7 @@ _NEVER = {
     "motion": ("fix_stamp", "heard_stamp", "velocity_stamp", "start_stamp", "last_stamp", "pause_stamp", "clock_stamp"),
     "mag": ("disturbed_stamp",),
     "heading": ("given_stamp", "tried_stamp", "contradicted_since"),
+    "heading_monitor": ("given_stamp", "given_moved"),
     "rest": (
         "block_end",
         "moving_stamp",

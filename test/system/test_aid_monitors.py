@@ -141,7 +141,6 @@ def test_velocities_that_claim_too_much_are_named() -> None:
     assert 1.5 < numbers(sentence)[0] < 3.5
 
 
-@pytest.mark.xfail(reason="changes of fixes count for nothing where the humble lane is wide", strict=False)
 def test_covariances_that_are_too_large_are_named() -> None:
     """What is left of the claim may last: that is modelled, and said as a note."""
     navigator = navigated("drive", 10, {"gnss.covariance_scale": 100.0})

@@ -91,11 +91,13 @@ def test_velocities_stamped_late_are_harmless_once_their_offset_is_given() -> No
         "one gyro axis negated",
         "accelerometer x and y swapped",
         "IMU yaw 8 deg off",
-        pytest.param("velocity in north, east, down", marks=pytest.mark.xfail(reason="multipath is named, too")),
+        "velocity in north, east, down",
         "clocks of IMU and receiver 1.2 s apart",
         "clock set by +0.5 s for the rest",
-        pytest.param("clock set by +10 s for the rest", marks=pytest.mark.xfail(reason="not named from arrays")),
+        "clock set by +10 s for the rest",
         "clock set by -0.5 s for the rest",
+        "positions stamped 0.25 s late",
+        "heading given 120 deg wrong",
     ],
 )
 def test_a_fault_is_named_and_no_other(name: str) -> None:
@@ -104,7 +106,6 @@ def test_a_fault_is_named_and_no_other(name: str) -> None:
     assert not figures.wrong
 
 
-@pytest.mark.xfail(reason="that receiver and IMU went different ways is said beside the right cause", strict=False)
 @pytest.mark.parametrize(
     ("name", "given", "parameter"),
     [

@@ -231,12 +231,19 @@ def test_thor75_agrees_with_the_filter_on_board(tmp_path: Path, data_folder: Cal
     assert_within(summary, "heading_deg", p50=0.38, p95=1.4)
 
 
-@pytest.mark.xfail(reason="after one takeover: the receiver and the IMU went different ways", strict=False)
 def test_husky_from_a_ros_1_bag(tmp_path: Path, data_folder: Callable[[str], Path]) -> None:
-    """Fixes of a metre and 1 m/s do not tell the heading; every fix is fused all the same."""
+    """Fixes of a metre and 1 m/s do not tell the heading; every fix is fused all the same.
+
+    From 45 to 65 s the fixes leave the path of wheels and gyro by 2.9 m rms, and their height falls by 17 m, at a claim
+    of 0.9 m: this is said, and nothing else.
+    """
     summary = replayed(husky_recording(tmp_path, data_folder("husky_test1")), truth="")
     # The fixes claim 1 m and change by 5 cm.
-    assert [text for text in summary["warnings"] if "their errors last" not in text] == []
+    (text,) = (text for text in summary["warnings"] if "their errors last" not in text)
+    assert re.match(DEPARTURES, text)
+    stamp = float(re.findall(r"at the stamp ([\d.]+)", text)[0])
+    begin = summary["final"]["stamp"] * 1e-9 - summary["duration_s"]
+    assert 45.0 < stamp - begin < 66.0
     fixes = summary["aids"]["gnss_position"]
     assert fixes["offered"] == 989
     assert fixes["fused"] + fixes["verdicts"]["before_alignment"] + fixes["verdicts"]["repeated"] == 989

@@ -13,7 +13,8 @@ import numpy as np
 from eskf_ros.compiled import njit
 from eskf_ros.filter.history.records import XX, YY
 from eskf_ros.filter.state.enums import Stream
-from eskf_ros.filter.state.time import NEVER
+from eskf_ros.filter.state.error_state import ATTITUDE
+from eskf_ros.filter.state.time import NEVER, SECOND
 from eskf_ros.geodesy.rotation import wrapped
 
 HEADING_MONITOR = np.dtype(
@@ -23,6 +24,11 @@ HEADING_MONITOR = np.dtype(
         ("field_found", "f8", (2,)),
         ("disturbed_fields", "f8"),
         ("field_count", "f8"),
+        ("given_stamp", "i8"),
+        ("given_std", "f8"),
+        ("given_off", "f8"),
+        ("given_moved", "i8"),
+        ("explained", "i8", (2,)),
     ],
     align=True,
 )
@@ -31,6 +37,10 @@ HEADING_MONITOR = np.dtype(
 ``sensor_contrast``: sums of the cosine and the sine of the difference, and their number, for the dual antenna (0) and
 the magnetometer (1); ``course_contrast``: the same for the course over ground. ``field_found``: strength (T) and
 inclination (rad) of the field last measured; ``disturbed_fields``, ``field_count``: disturbed readings, and all.
+
+``given_stamp``, ``given_std``: when the heading was given that is watched (ns), and its standard deviation (rad).
+``given_off``: by how much measurements have turned it since (rad). ``given_moved``: when the robot first moved with it
+(ns). ``explained``: the takeovers of the humble lane and the departures of the first receiver meanwhile.
 """
 
 
@@ -45,6 +55,12 @@ ALIKE = 0.9
 
 FAR_OFF_DEG = 30.0
 """deg; smaller mean differences of headings are not reported."""
+
+FIRST_MOTION = 90 * SECOND
+"""ns; of motion, within which a heading that was given and is wrong is corrected."""
+
+WRONG_SIGMAS, LEAST_WRONG = 4.0, math.radians(15.0)
+"""Standard deviations and rad by which a heading that was given must have been corrected to be called wrong."""
 
 
 @njit
@@ -83,6 +99,44 @@ def watch_course(state, aid, heading, settings):
 
 
 @njit
+def watch_given_heading(state, given_before, turned):
+    """Add up by how much measurements turn a heading that was given, ``turned`` (rad) by the present one.
+
+    ``given_before`` (ns): when it was given, as the state had it before this measurement. A heading that is wrong is
+    corrected at once or bit by bit, and what receivers and lanes contradicted meanwhile says nothing else.
+    """
+    monitor = state.heading_monitor
+    if given_before not in (NEVER, monitor.given_stamp):
+        monitor.given_std = math.sqrt(state.covariance[ATTITUDE + 2, ATTITUDE + 2])
+        monitor.given_off = 0.0
+        monitor.given_moved = NEVER
+        monitor.given_stamp = given_before
+    if monitor.given_stamp == NEVER:
+        return
+    if state.heading.given_stamp > monitor.given_stamp:
+        # The course over ground has replaced it.
+        monitor.given_stamp = state.heading.given_stamp
+    if monitor.given_moved == NEVER:
+        if state.window.motion_stamp > monitor.given_stamp:
+            monitor.given_moved = state.stamp
+    elif state.stamp - monitor.given_moved > FIRST_MOTION:
+        return
+    monitor.given_off += turned
+    monitor.explained[0] = state.trust.takeovers
+    monitor.explained[1] = state.receiver.departures[0]
+    if abs(monitor.given_off) > wrong_by(monitor.given_std):
+        state.installation.information.fill(0.0)
+        state.installation.evidence.fill(0.0)
+        state.installation.misfit.fill(0.0)
+
+
+@njit
+def wrong_by(std):
+    """Return by how much (rad) a heading given with a standard deviation (rad) must be corrected to be called wrong."""
+    return max(WRONG_SIGMAS * std, LEAST_WRONG)
+
+
+@njit
 def has_lasting_difference(sums):
     """Say whether the angles of such sums are many, alike and far from zero."""
     cosine, sine, count = sums[0], sums[1], sums[2]
@@ -101,7 +155,21 @@ def is_heading_contradicted(state: np.void) -> bool:
     return any(has_lasting_difference(sums) for sums in state["heading_monitor"]["sensor_contrast"])
 
 
+def given_heading_complaints(state: np.void) -> list[str]:
+    """Return a sentence if the heading that was given was wrong."""
+    monitor = state["heading_monitor"]
+    off, std = abs(float(monitor["given_off"])), math.sqrt(float(state["covariance"][ATTITUDE + 2, ATTITUDE + 2]))
+    is_known = state["heading_known"] and WRONG_SIGMAS * std < off
+    if monitor["given_stamp"] == NEVER or off < wrong_by(float(monitor["given_std"])) or not is_known:
+        return []
+    return [
+        "the heading that was given (alignment.initial_heading_deg, warm start, initialpose) was off by "
+        f"{math.degrees(off):.0f} deg, and has been corrected"
+    ]
+
+
 def heading_complaints(state: np.void) -> list[str]:
+    """Return one sentence for each fault of headings, course and magnetic field."""
     found = []
     if state["heading_monitor"]["disturbed_fields"] > max(
         LASTING_COUNT, ALIKE * float(state["heading_monitor"]["field_count"])

@@ -105,6 +105,7 @@ INSTALLATION = np.dtype(
         ("absorbed", "f8", (SOURCES, ERROR_CAPACITY, FAULTS)),
         ("information", "f8", (SOURCES, FAULTS, FAULTS)),
         ("evidence", "f8", (SOURCES, FAULTS)),
+        ("misfit", "f8", (SOURCES, 2)),
         ("checked", "i8"),
         ("estimate", "f8", (SOURCES, FAULTS)),
         ("found", "f8", (SOURCES, FAULTS)),
@@ -120,7 +121,8 @@ INSTALLATION = np.dtype(
 
 - ``stamp``, ``force``: stamp (ns) and specific force (m/s2, map) of its last step.
 - ``absorbed``: derivative of the errors, augmented states included, by the faults.
-- ``information``, ``evidence``: normal equations of the faults.
+- ``information``, ``evidence``: normal equations of the faults. ``misfit``: sum of the NIS that they are to explain,
+  and of its degrees of freedom.
 - ``checked``: when they were solved last (ns).
 - ``estimate``, ``covariance``, ``sigma``: the faults, true minus configured, their covariance and standard deviations.
 - ``found``: those that are certain, else 0; ``held``: for how many looks in a row they have been so.
@@ -245,6 +247,7 @@ def forget_faults(state):
     state.installation.stamp = NEVER
     state.installation.information.fill(0.0)
     state.installation.evidence.fill(0.0)
+    state.installation.misfit.fill(0.0)
     state.installation.found.fill(0.0)
     state.installation.estimate.fill(0.0)
     state.installation.is_considered.fill(0)
@@ -334,6 +337,12 @@ def weigh_faults(state, source, dt, weight, work):
     """
     inverse, effect = work.innovation_covariance, work.effect
     remains = max(0.0, 1.0 - dt / MEMORY)
+    misfit = state.installation.misfit[source]
+    misfit[0] *= remains
+    misfit[1] = remains * misfit[1] + 3.0
+    for a in range(3):
+        for b in range(3):
+            misfit[0] += weight * work.innovation[a] * inverse[a, b] * work.innovation[b]
     for k in range(FAULTS):
         state.installation.evidence[source, k] *= remains
         for m in range(FAULTS):
@@ -351,8 +360,8 @@ def weigh_faults(state, source, dt, weight, work):
 def find_faults(state, work):
     """Solve the normal equations every `CHECK_INTERVAL`, and note which faults are certain.
 
-    Innovations and a scatter that are larger than expected widen the standard deviations, and errors of fixes that last
-    do. A large fault leaks into the estimates of the others.
+    Innovations that the faults leave unexplained, and a scatter that is larger than expected, widen the standard
+    deviations, and errors of fixes that last do. A large fault leaks into the estimates of the others.
     """
     if state.stamp - state.installation.checked < CHECK_INTERVAL:
         return
@@ -367,6 +376,7 @@ def find_faults(state, work):
             covariance[k, k] += 1.0 / FAULT_PRIOR[k] ** 2
         if invert_positive(covariance, FAULTS) == 0.0:
             continue
+        excess = max(excess, unexplained(state, source, covariance))
         largest = 0.0
         for k in range(FAULTS):
             estimate = 0.0
@@ -385,6 +395,16 @@ def find_faults(state, work):
                 state.installation.found[source, k] = 0.0
             is_certain = state.installation.found[source, k] != 0.0
             state.installation.held[source, k] = state.installation.held[source, k] + 1 if is_certain else 0
+
+
+@njit
+def unexplained(state, source, covariance):
+    """Return the NIS per degree of freedom that the faults, of a ``covariance`` (7, 7), leave unexplained."""
+    evidence, explained = state.installation.evidence[source], 0.0
+    for k in range(FAULTS):
+        for m in range(FAULTS):
+            explained += evidence[k] * covariance[k, m] * evidence[m]
+    return (state.installation.misfit[source, 0] - explained) / max(state.installation.misfit[source, 1], 1.0)
 
 
 @njit

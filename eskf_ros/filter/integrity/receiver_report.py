@@ -7,6 +7,7 @@ import math
 import numpy as np
 from scipy.special import chdtri
 
+from eskf_ros.filter.integrity.heading_monitor import given_heading_complaints
 from eskf_ros.filter.integrity.installation_monitor import (
     GYRO_DRIFT,
     GYRO_SCALE,
@@ -14,7 +15,7 @@ from eskf_ros.filter.integrity.installation_monitor import (
     POSITION_TIME,
     VELOCITY_TIME,
 )
-from eskf_ros.filter.integrity.motion_report import has_compared
+from eskf_ros.filter.integrity.motion_report import LONGEST_COMPARISON, has_compared
 from eskf_ros.filter.integrity.receiver_monitor import (
     FEW_DEPARTURES,
     HIGH_NIS,
@@ -31,6 +32,20 @@ DOUBTFUL_SIGMAS = 15.0
 
 VERTICAL_SIGMAS = 30.0
 """The same for a vertical lever arm: it shows by roll and pitch alone, and many other errors go with those."""
+
+LEAST_DELAY, DELAY_SIGMAS, OPEN_SIGMAS = 0.05, 4.0, 2.5
+"""s and standard deviations by which positions must be later than the velocities of the same receiver to be told so,
+and from which on they may be: no other cause is told meanwhile."""
+
+CERTAIN_DELAY_STD = 0.07
+"""s; standard deviation of that time above which it is waited for before fixes are blamed that move otherwise than the
+velocities, for `LONGEST_COMPARISON` at most."""
+
+CERTAIN_TIME_STD = 0.02
+"""s; standard deviation of the time offset of positions above which takeovers may come from one."""
+
+NOTABLE_CALM = 0.6
+"""Share of the claims that must last for a note."""
 
 NOISY_IMU = (
     "imu.*_noise_density or imu.*_bias_random_walk is too small for it, its bias changes, or its axes or its scale are "
@@ -52,18 +67,27 @@ def aid_complaints(state: np.void, settings: np.void, is_explained: bool, is_imu
     for source in range(SOURCES):
         if is_explained or state["receiver"]["fix_count"][source] < MANY_FIXES:
             continue
-        lies = _covariance_complaints(state, source, float(settings["gnss_covariance_scale"]))
+        late, std = _delay(state) if source == 0 else (0.0, 0.0)
+        is_waiting = std > CERTAIN_DELAY_STD and int(state["stamp"]) - int(state["first_stamp"]) < LONGEST_COMPARISON
+        is_delayed = abs(late) > max(LEAST_DELAY, OPEN_SIGMAS * std)
+        scale = float(settings["gnss_covariance_scale"])
+        lies = _covariance_complaints(state, source, scale, is_waiting or is_delayed)
         # Fixes that scatter seem to jump.
         paths = [] if lies else _path_complaints(state, source)
-        faults = _fault_complaints(state, settings, source, is_imu_doubtful or bool(paths))
+        is_doubtful = is_imu_doubtful or bool(paths) or _departures(state, source) >= FEW_DEPARTURES
+        faults = _fault_complaints(state, settings, source, is_doubtful)
+        # Velocities that are late by the IMU are the cause themselves.
+        if is_delayed and state["installation"]["held"][source, VELOCITY_TIME] < LASTING_LOOKS:
+            faults = _delay_complaints(settings, late, std)
         # Those faults explain drifts, contradictions and a high NIS: no sentences of their own.
         found += paths + faults + lies
         # One that is not certain for long may do so, too; or axes of the IMU, which take their time.
-        is_open = bool(state["installation"]["found"][source].any())
+        is_open = is_delayed or bool(state["installation"]["found"][source].any())
         if is_certain and not is_open and not paths and not faults and not lies:
             found += _velocity_complaints(state, source) + _departure_complaints(state, source)
     if state["recovery"]["resets"]:
-        cause = "" if found or not is_certain else f": multipath for many seconds; or {NOISY_IMU}"
+        is_explained = bool(found or given_heading_complaints(state))
+        cause = "" if is_explained or not is_certain else f": multipath for many seconds; or {NOISY_IMU}"
         found.append(
             f"{int(state['recovery']['resets'])} times fixes that agree with each other contradicted the filter for so "
             f"long that position and velocity were reset to them{cause}"
@@ -126,11 +150,14 @@ def _fault_complaints(state: np.void, settings: np.void, source: int, is_doubtfu
     return texts
 
 
-def _covariance_complaints(state: np.void, source: int, scale: float) -> list[str]:
+def _covariance_complaints(state: np.void, source: int, scale: float, may_be_late: bool) -> list[str]:
+    """Return a sentence if fixes scatter, or move otherwise than velocities, but if they ``may_be_late``."""
     count, scattered = int(state["receiver"]["fix_count"][source]), int(state["receiver"]["scattered_fixes"][source])
     if scattered > max(MANY_FIXES, count // 10):
         factor = float(state["receiver"]["scatter_sum"][source]) / scattered
         if float(state["scatter"]["change"][source]) < 0.5 * factor:
+            if may_be_late:
+                return []
             return [
                 f"{scattered} of {count} fixes{_of(source)} moved otherwise than the velocities of the same receiver, "
                 f"by {math.sqrt(factor):.1f} times what they claim: multipath or spoofing, or errors that last for "
@@ -148,7 +175,7 @@ def aid_notes(state: np.void) -> list[str]:
     found = []
     for source in range(SOURCES):
         change, pairs = float(state["scatter"]["change"][source]), float(state["scatter"]["pairs"][source])
-        if pairs > 2 * MANY_FIXES and state["scatter"]["calm"][source] > 0.0:
+        if pairs > 2 * MANY_FIXES and state["scatter"]["calm"][source] > NOTABLE_CALM:
             found.append(
                 f"the fixes{_of(source)} change by {math.sqrt(change):.2f} times what they claim from one to the next: "
                 "their errors last. This is allowed for (gnss.correlation_time, gnss.correlated_share)"
@@ -172,6 +199,26 @@ def _velocity_complaints(state: np.void, source: int) -> list[str]:
     ]
 
 
+def _delay(state: np.void) -> tuple[float, float]:
+    """Return by how much (s) positions are stamped later than velocities, and its standard deviation; or zeros."""
+    product, gained, off = (float(value) for value in state["motion"]["delay"])
+    if gained == 0.0:
+        return 0.0, 0.0
+    left = max(0.0, off - product * product / gained)
+    return -product / gained, math.sqrt(left / (2.0 * float(state["motion"]["axes"][2]) * gained))
+
+
+def _delay_complaints(settings: np.void, late: float, std: float) -> list[str]:
+    if abs(late) < max(LEAST_DELAY, DELAY_SIGMAS * std):
+        return []
+    right = float(settings["gnss_time_offset"][0]) - late
+    return [
+        f"the positions are stamped {abs(late):.2f} s (+- {std:.2f}) {'later' if late > 0.0 else 'earlier'} than the "
+        f"velocities of the same receiver: set gnss.time_offset to {right:.3f} and gnss.velocity_time_offset to "
+        f"{float(settings['velocity_time_offset']) + late:.3f}"
+    ]
+
+
 def _path_complaints(state: np.void, source: int) -> list[str]:
     found = []
     jumps = int(state["trust"]["jumps"][0, source])
@@ -182,11 +229,23 @@ def _path_complaints(state: np.void, source: int) -> list[str]:
     return found
 
 
+def _departures(state: np.void, source: int) -> int:
+    """Return how often a receiver drifted off the path of the IMU, which no wrong given heading explains."""
+    departures = int(state["receiver"]["departures"][source])
+    if source == 0 and given_heading_complaints(state):
+        departures -= int(state["heading_monitor"]["explained"][1])
+    return departures
+
+
 def _departure_complaints(state: np.void, source: int) -> list[str]:
     """Return a sentence if a receiver drifted off the path of the IMU, or the humble lane had to take over."""
-    departures, stamp = int(state["receiver"]["departures"][source]), int(state["receiver"]["departure_stamp"][source])
+    departures, stamp = _departures(state, source), int(state["receiver"]["departure_stamp"][source])
     takeovers = int(state["trust"]["takeovers"]) if source == 0 else 0
-    if departures < FEW_DEPARTURES and not takeovers:
+    if source == 0 and given_heading_complaints(state):
+        takeovers -= int(state["heading_monitor"]["explained"][0])
+    is_early = int(state["stamp"]) - int(state["first_stamp"]) < LONGEST_COMPARISON
+    may_be_late = is_early and float(state["installation"]["sigma"][source, POSITION_TIME]) > CERTAIN_TIME_STD
+    if departures < FEW_DEPARTURES and (may_be_late or not takeovers):
         return []
     if not departures:
         stamp = int(state["trust"]["doubt_stamp"])

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from eskf_ros.filter.integrity.heading_monitor import LASTING_COUNT, heading_complaints
+from eskf_ros.filter.integrity.heading_monitor import LASTING_COUNT, given_heading_complaints, heading_complaints
 from eskf_ros.filter.integrity.imu_monitor import BIASED_WINDOWS, FASTEST_TURN, GRAVITY_TOLERANCE, MANY_GAPS
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.geodesy.earth import STANDARD_GRAVITY
@@ -72,7 +72,8 @@ def gap_complaints(state: np.void) -> list[str]:
 
 def other_complaints(state: np.void) -> list[str]:
     """Return one sentence for each fault of headings and rejected velocities, with what to do."""
-    return heading_complaints(state) + _refused_complaints(state)
+    contradictions = heading_complaints(state)
+    return (contradictions or given_heading_complaints(state)) + _refused_complaints(state)
 
 
 def imu_faults(state: np.void) -> list[str]:
