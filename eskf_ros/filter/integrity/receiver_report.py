@@ -32,7 +32,7 @@ LEAST_DELAY, DELAY_SIGMAS, OPEN_SIGMAS = 0.05, 4.0, 2.5
 and from which on they may be: no other cause is told meanwhile."""
 
 FEWEST_GAINS, LEAST_GAIN = 40, 0.5
-"""Windows, and mean square (m2/s2) of the changes of velocity in them, from which on it is found: else noise would be."""
+"""Windows, and mean square (m2/s2) of the changes of velocity in them, from which on it is found: less is noise."""
 
 CERTAIN_DELAY_STD = 0.07
 """s; standard deviation of that time above which it is waited for before fixes are blamed that move otherwise than the
