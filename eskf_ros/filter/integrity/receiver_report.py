@@ -37,6 +37,9 @@ LEAST_DELAY, DELAY_SIGMAS, OPEN_SIGMAS = 0.05, 4.0, 2.5
 """s and standard deviations by which positions must be later than the velocities of the same receiver to be told so,
 and from which on they may be: no other cause is told meanwhile."""
 
+FEWEST_GAINS, LEAST_GAIN = 40, 0.5
+"""Windows, and mean square (m2/s2) of the changes of velocity in them, from which on it is found: less is noise."""
+
 CERTAIN_DELAY_STD = 0.07
 """s; standard deviation of that time above which it is waited for before fixes are blamed that move otherwise than the
 velocities, for `LONGEST_COMPARISON` at most."""
@@ -202,10 +205,11 @@ def _velocity_complaints(state: np.void, source: int) -> list[str]:
 def _delay(state: np.void) -> tuple[float, float]:
     """Return by how much (s) positions are stamped later than velocities, and its standard deviation; or zeros."""
     product, gained, off = (float(value) for value in state["motion"]["delay"])
-    if gained == 0.0:
+    windows = float(state["motion"]["axes"][2])
+    if windows < FEWEST_GAINS or gained < LEAST_GAIN * windows:
         return 0.0, 0.0
     left = max(0.0, off - product * product / gained)
-    return -product / gained, math.sqrt(left / (2.0 * float(state["motion"]["axes"][2]) * gained))
+    return -product / gained, math.sqrt(left / (2.0 * windows * gained))
 
 
 def _delay_complaints(settings: np.void, late: float, std: float) -> list[str]:
