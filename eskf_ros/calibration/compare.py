@@ -99,6 +99,16 @@ def antenna_at(rows: NDArray[Any], stamp: int, parameters: Parameters) -> Array:
     return arm
 
 
+def compared(
+    recording: Recording, before: Parameters, after: Parameters, outage: tuple[float, float], truth: str = ""
+) -> dict[str, dict[str, Any]]:
+    """Return "before" and "after", each as of `figures_of`."""
+    return {
+        label: figures_of(recording, parameters, outage, truth)
+        for label, parameters in (("before", before), ("after", after))
+    }
+
+
 def figures_of(
     recording: Recording, parameters: Parameters, outage: tuple[float, float], truth: str = ""
 ) -> dict[str, Any]:

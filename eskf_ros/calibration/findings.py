@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from eskf_ros.calibration.coarse_mounting import CoarseMounting
 from eskf_ros.calibration.combine import Combined
 from eskf_ros.calibration.constants import Constant, value_of
-from eskf_ros.calibration.noise import rest_and_road
-from eskf_ros.calibration.recording import Pass, Recording
+from eskf_ros.calibration.recording import Look, Pass
 from eskf_ros.calibration.roll import SHOWN_BY as ROLL_SHOWN_BY
 from eskf_ros.calibration.roll import Roll
 from eskf_ros.parameters.mapping import from_mapping, to_mapping
@@ -146,9 +145,9 @@ def roll_finding(current: Parameters, roll: Roll, coarse: CoarseMounting | None)
     return Finding("mounting_roll", "imu.mount_rpy_deg", 0, value, value, std, "deg", roll.is_known, text)
 
 
-def noise_findings(given: Sequence[Recording], parameters: Parameters) -> list[Finding]:
+def noise_findings(looks: Sequence[Look], parameters: Parameters) -> list[Finding]:
     """Return the noise densities of the IMU, for those parameters that are at their defaults."""
-    seen = [rest_and_road(recording.tables) for recording in given]
+    seen = [(look.rest, look.road) for look in looks]
     found = []
     for name, unit in (("gyro", "rad/s/rtHz"), ("accel", "m/s2/rtHz")):
         key = f"{name}_noise_density"
