@@ -34,14 +34,17 @@ from eskf_ros.calibration.constants import (
 from eskf_ros.calibration.findings import (
     Calibration,
     findings_of,
+    findings_of_ranges,
     noise_findings,
     roll_finding,
     with_consequences,
     with_noise,
 )
+from eskf_ros.calibration.ranges import constants_of_ranges, with_fixes, with_ranges
 from eskf_ros.calibration.recording import Look, Pass, Recording, as_recording, look_at, run_pass
 from eskf_ros.calibration.roll import Roll, weighed_mean
 from eskf_ros.filter.measurements.row import to_base
+from eskf_ros.inputs.table import uses_ranges
 from eskf_ros.parameters.ros_yaml import load
 from eskf_ros.parameters.tree import Parameters
 
@@ -101,6 +104,11 @@ def calibrate(
     given = [as_recording(source, parameters) for source in sources]
     if not given:
         raise ValueError("there is no recording to calibrate with")
+    told, has_ranges = parameters, uses_ranges(parameters)
+    if has_ranges:
+        if any(recording.held is not None for recording in given):
+            raise ValueError("mode tight is calibrated with recordings: tables have no ranges of satellites")
+        parameters = with_fixes(parameters)
     given, looks = each_of(given, partial(look_at, may_be_vehicle=is_vehicle is not False), each)
     inputs = {name for look in looks for name in look.inputs}
     if is_vehicle is None:
@@ -112,6 +120,8 @@ def calibrate(
     if is_vehicle:
         start, coarse = with_coarse_mounting(looks, start, warnings, say)
     constants = constants_of(inputs, is_vehicle)
+    if has_ranges:
+        constants = constants_of_ranges(constants)
     given, current, combined, passes, moved, roll, count = iterate(
         given, start, constants, is_vehicle, each, warnings, say
     )
@@ -125,7 +135,9 @@ def calibrate(
         both = partial(compared, before=parameters, after=final, outage=OUTAGE, truth=truth)
         given, pairs = each_of(given, both, each)
         figures = {label: [pair[label] for pair in pairs] for label in ("before", "after")}
-    return Calibration(parameters, final, [*findings, *noises], figures, [r.name for r in given], count, warnings)
+    if has_ranges:
+        findings, final = findings_of_ranges(findings, told), with_ranges(final, told)
+    return Calibration(told, final, [*findings, *noises], figures, [r.name for r in given], count, warnings)
 
 
 def each_of(

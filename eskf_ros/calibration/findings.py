@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -175,6 +176,19 @@ def with_noise(parameters: Parameters, noises: Sequence[Finding]) -> Parameters:
     values: dict[str, Any] = dict(to_mapping(parameters))
     values |= {finding.parameter: finding.value for finding in noises if finding.is_shown}
     return from_mapping(values)
+
+
+def findings_of_ranges(findings: Sequence[Finding], given: Parameters) -> list[Finding]:
+    """Return the findings with the time offset as that of the ranges."""
+    found = []
+    for finding in findings:
+        if finding.name == "time_offset":
+            offset = given.ranges.time_offset
+            before, value = finding.before + offset, finding.value + offset
+            found.append(dataclasses.replace(finding, parameter="ranges.time_offset", before=before, value=value))
+        elif finding.name != "velocity_time_offset":
+            found.append(finding)
+    return found
 
 
 LEFT_TO_THE_NODE: dict[str, dict[str, Any]] = {

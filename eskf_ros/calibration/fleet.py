@@ -105,7 +105,8 @@ class Rounds:
 def task_of(recording: Recording, step: partial[Any], folder: Path) -> Task:
     """Return the task of a step with one recording."""
     assert recording.path is not None
-    files = files_of(recording.path)
+    navigation = recording.parameters.ranges.rinex_nav_files
+    files = [*files_of(recording.path), *(Path(name) for name in navigation.split(":") if name)]
     values = {"step": step.func.__name__, "topics": to_mapping(recording.parameters), **step.keywords}
     return Task(
         name=recording.name,

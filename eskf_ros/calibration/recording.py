@@ -16,10 +16,10 @@ from eskf_ros.api import Filter
 from eskf_ros.calibration.coarse_mounting import CoarseMounting, coarse_mounting
 from eskf_ros.calibration.constants import Constant, places_of
 from eskf_ros.calibration.noise import Density, rest_and_road
+from eskf_ros.calibration.ranges import read_tables
 from eskf_ros.calibration.roll import ROW_RATE, Roll, roll_of
 from eskf_ros.filter.state.error_state import ERROR_SIZE
 from eskf_ros.parameters.tree import Parameters
-from eskf_ros.tables.bag import read_bag
 
 Array = NDArray[np.float64]
 Tables = Mapping[str, Any]
@@ -48,7 +48,7 @@ class Recording:
 
 @lru_cache(maxsize=1)
 def _read(path: Path, parameters: Parameters) -> Tables:
-    return read_bag(path, parameters)
+    return read_tables(path, parameters)
 
 
 @dataclass(frozen=True)

@@ -126,6 +126,39 @@ def test_the_mounting_of_a_dual_antenna_is_refused_without_accelerations(name: s
     assert found.parameters.heading == parameters.heading
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_lever_arm_and_time_offset_of_ranges_are_found_in_mode_tight(tmp_path: Path, seed: int) -> None:
+    bag = tmp_path / "drive.mcap"
+    arguments = ["drive", "--out", str(bag), "--seed", str(seed), "--imu-rate", "50", "--sensor", "ranges", "--quiet"]
+    assert simulate_bag([*arguments, "--set", "lever_arm=0.8/-0.2/1.4"]) == 0
+    # The stamps are right: what is configured is what is wrong with them.
+    given = from_mapping({"mode": "tight", "ranges.time_offset": 0.1, "gnss.time_offset": 0.5})
+    found = eskf_ros.calibrate(bag, given, is_vehicle=False, compares=False)
+    assert found.parameters.mode == "tight"
+    assert found.parameters.gnss.time_offset == 0.5
+    for name, value, bound in (("lever_arm_x", 0.8, 0.05), ("lever_arm_y", -0.2, 0.05), ("time_offset", 0.0, 0.003)):
+        finding = found.named(name)
+        assert finding.is_shown, finding
+        assert abs(finding.value - value) < min(bound, 3.0 * finding.std), finding
+    assert found.named("time_offset").parameter == "ranges.time_offset"
+    assert found.parameters.ranges.time_offset == pytest.approx(found.named("time_offset").value)
+    np.testing.assert_allclose(found.parameters.gnss.lever_arm[0], found.named("lever_arm_x").value)
+
+
+def test_mode_tight_without_ranges_is_refused_with_what_to_do(
+    tmp_path: Path, fleet: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "tight.yaml"
+    config.write_text("/**:\n  ros__parameters:\n    mode: tight\n")
+    bag = str(fleet / "day_1" / "drive.mcap")
+    assert main([bag, "--config", str(config), "--out", str(tmp_path / "found.yaml")]) == 2
+    error = capsys.readouterr().err
+    assert "no topic gnss/ranges" in error
+    assert "eskf_ranges writes those" in error
+    with pytest.raises(ValueError, match="tables have no ranges"):
+        calibrate(tables_of(simulate("drive", 1, **RTK, stop=20.0)), from_mapping({"mode": "tight"}))
+
+
 def test_several_recordings_are_better_than_one_and_may_run_side_by_side() -> None:
     drives = [tables_of(simulate("drive", seed, **RTK, stop=100.0), OFFSETS) for seed in (1, 2)]
     parameters = from_mapping({"gnss.lever_arm": list(LEVER_ARM)})
