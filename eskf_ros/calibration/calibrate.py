@@ -7,9 +7,9 @@ what the one before has found. Where the recordings leave a constant open, its v
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 from os import PathLike
 from typing import Any
@@ -104,11 +104,30 @@ def calibrate(
     given = [as_recording(source, parameters) for source in sources]
     if not given:
         raise ValueError("there is no recording to calibrate with")
-    told, has_ranges = parameters, uses_ranges(parameters)
-    if has_ranges:
-        if any(recording.held is not None for recording in given):
-            raise ValueError("mode tight is calibrated with recordings: tables have no ranges of satellites")
-        parameters = with_fixes(parameters)
+    if not uses_ranges(parameters):
+        return calibrated(given, parameters, constants_of, is_vehicle, truth, compares, each, say)
+    if any(recording.held is not None for recording in given):
+        raise ValueError("mode tight is calibrated with recordings: tables have no ranges of satellites")
+    found = calibrated(given, with_fixes(parameters), constants_of_ranges, is_vehicle, truth, compares, each, say)
+    return replace(
+        found,
+        before=parameters,
+        parameters=with_ranges(found.parameters, parameters),
+        findings=findings_of_ranges(found.findings, parameters),
+    )
+
+
+def calibrated(
+    given: list[Recording],
+    parameters: Parameters,
+    wanted: Callable[[set[str], bool], tuple[Constant, ...]],
+    is_vehicle: bool | None,
+    truth: str,
+    compares: bool,
+    each: Each,
+    say: Callable[[str], None],
+) -> Calibration:
+    """Return the calibration with positions and velocities, of the constants ``wanted`` of inputs and vehicle."""
     given, looks = each_of(given, partial(look_at, may_be_vehicle=is_vehicle is not False), each)
     inputs = {name for look in looks for name in look.inputs}
     if is_vehicle is None:
@@ -119,9 +138,7 @@ def calibrate(
     coarse = None
     if is_vehicle:
         start, coarse = with_coarse_mounting(looks, start, warnings, say)
-    constants = constants_of(inputs, is_vehicle)
-    if has_ranges:
-        constants = constants_of_ranges(constants)
+    constants = wanted(inputs, is_vehicle)
     given, current, combined, passes, moved, roll, count = iterate(
         given, start, constants, is_vehicle, each, warnings, say
     )
@@ -135,9 +152,7 @@ def calibrate(
         both = partial(compared, before=parameters, after=final, outage=OUTAGE, truth=truth)
         given, pairs = each_of(given, both, each)
         figures = {label: [pair[label] for pair in pairs] for label in ("before", "after")}
-    if has_ranges:
-        findings, final = findings_of_ranges(findings, told), with_ranges(final, told)
-    return Calibration(told, final, [*findings, *noises], figures, [r.name for r in given], count, warnings)
+    return Calibration(parameters, final, [*findings, *noises], figures, [r.name for r in given], count, warnings)
 
 
 def each_of(
@@ -239,5 +254,5 @@ def start_with(
     assert set(back) <= {constant.name for constant in CONSTANTS}
     found = changed(current, back)
     if "heading_offset" in refused:  # The baseline is where it was in the axes of the vehicle, not in those of the IMU.
-        found = dataclasses.replace(found, heading=start.heading)
+        found = replace(found, heading=start.heading)
     return found

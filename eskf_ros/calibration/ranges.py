@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.bags import open_bag
-from eskf_ros.calibration.constants import Constant
+from eskf_ros.calibration.constants import Constant, constants_of
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.gnss.rinex import RinexError
 from eskf_ros.inputs.epochs import RangeIntake
@@ -54,11 +54,11 @@ def with_ranges(found: Parameters, given: Parameters) -> Parameters:
     return from_mapping(dict(to_mapping(found)) | back | {"ranges.time_offset": offset})
 
 
-def constants_of_ranges(constants: Sequence[Constant]) -> tuple[Constant, ...]:
-    """Return the constants, of which the velocities have no time offset of their own."""
+def constants_of_ranges(inputs: Collection[str], is_vehicle: bool) -> tuple[Constant, ...]:
+    """Return what `constants_of` returns, but that velocities have no time offset of their own."""
     return tuple(
         dataclasses.replace(constant, prior_std=NO_OFFSET_STD) if constant.name == "velocity_time_offset" else constant
-        for constant in constants
+        for constant in constants_of(inputs, is_vehicle)
     )
 
 
