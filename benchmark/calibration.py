@@ -8,6 +8,7 @@ Prints the table of docs/calibrate.md for each case: error, sigma and error over
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -86,6 +87,10 @@ def tables_of(recording: Recording, offsets: Sequence[float] = (0.0, 0.0, 0.0)) 
             "covariance": recording.velocity_covariance,
         },
     }
+    heading = recording.dual_antenna
+    if heading is not None:
+        variance = np.full(len(heading.stamp), math.radians(heading.sensor.yaw_std_deg) ** 2)
+        tables["heading"] = {"stamp": heading.stamp, "yaw": heading.yaw, "covariance": variance}
     wheel = recording.wheel
     if wheel is not None:
         tables["wheel"] = {

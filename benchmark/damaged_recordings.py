@@ -80,17 +80,20 @@ def replay(recording: Path, out: Path, mode: str) -> Replayed:
     stderr = io.StringIO()
     with contextlib.redirect_stderr(stderr), contextlib.redirect_stdout(io.StringIO()):
         code = eskf_replay([str(recording), "--out", str(out), "--mode", mode, "--quiet"])
-    found = sorted(out.glob("*_eskf/summary.json"))
-    summary = json.loads(found[0].read_text()) if found else {"imu_count": 0, "aids": {}, "final": None}
-    # Of ranges the messages are counted, not their signals.
-    offered = {name: int(aid["offered"]) for name, aid in summary["aids"].items() if aid["withheld"] is not None}
-    offered |= {"ranges": summary["ranges"]["epochs"]} if "ranges" in summary else {}
+    summaries = [json.loads(file.read_text()) for file in sorted(out.glob("*_eskf/summary.json"))]
+    offered: Counter[str] = Counter()  # A folder of .mcap files is a fleet: of all its recordings.
+    for summary in summaries:
+        offered["imu"] += summary["imu_count"]
+        # Of ranges the messages are counted, not their signals.
+        for name, aid in summary["aids"].items():
+            offered[name] += int(aid["offered"]) if aid["withheld"] is not None else 0
+        offered["ranges"] += summary["ranges"]["epochs"] if "ranges" in summary else 0
     lines = tuple(line for line in stderr.getvalue().splitlines() if ": compiling " not in line)
     counts: tuple[int, ...] = ()
     if code == 0:
         with open_bag([recording]) as reader:
             counts = tuple(sorted(info.count for info in reader.topics.values()))
-    return Replayed(code, lines, {"imu": summary["imu_count"], **offered}, summary["final"], counts)
+    return Replayed(code, lines, dict(offered), [summary["final"] for summary in summaries], counts)
 
 
 def replay_apart(files: Files, mode: str, keep: Path | None = None) -> tuple[str, Any]:
@@ -144,8 +147,8 @@ def judged(done: Replayed, whole: Replayed) -> tuple[str, str]:
     new = [line for line in done.lines if line not in whole.lines]
     named = [line for line in new if "RECORDING" in line]
     if done.code == 2:
-        is_one_line = len(done.lines) == 1 and done.lines[0].startswith("eskf_replay: error: ") and bool(named)
-        return ("said, not readable", done.lines[0]) if is_one_line else ("silence", str(done.lines))
+        is_one_line = len(new) == 1 and new[0].startswith("eskf_replay: error: ") and bool(named)
+        return ("said, not readable", new[0]) if is_one_line else ("silence", str(done.lines))
     strange = [line for line in done.lines if not line.startswith("eskf_replay: warning: ")]
     if done.code or strange:
         return "traceback", f"exit code {done.code}: {done.lines}"

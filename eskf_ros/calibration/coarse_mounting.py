@@ -44,12 +44,17 @@ LEAST_ACCELERATION = 0.25
 
 @dataclass(frozen=True)
 class CoarseMounting:
-    """``rotation``: IMU to vehicle; ``std_deg``: about how good it is; ``lag`` (s): velocities are so late."""
+    """``quaternion``: IMU to vehicle, x, y, z, w; ``std_deg``: about how good it is; ``lag`` (s): of velocities."""
 
-    rotation: Rotation
+    quaternion: tuple[float, ...]
     std_deg: float
     lag: float
     count: int
+
+    @property
+    def rotation(self) -> Rotation:
+        """IMU to vehicle."""
+        return Rotation.from_quat(self.quaternion)
 
 
 def coarse_mounting(tables: Mapping[str, Any]) -> CoarseMounting | None:
@@ -81,8 +86,9 @@ def coarse_mounting(tables: Mapping[str, Any]) -> CoarseMounting | None:
         axes, error, std = fit(design[inside], mean)
         if error < least:
             least = error
-            rotation = Rotation.from_matrix(nearest_rotation(axes, design[inside]))
-            best = CoarseMounting(rotation, float(np.degrees(std)), float(lag), int(np.count_nonzero(inside)))
+            quaternion = Rotation.from_matrix(nearest_rotation(axes, design[inside])).as_quat()
+            count = int(np.count_nonzero(inside))
+            best = CoarseMounting(tuple(quaternion.tolist()), float(np.degrees(std)), float(lag), count)
     return best
 
 

@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from eskf_ros.calibration.ranges import with_ranges
 from eskf_ros.calibration.recording import Recording, filtered, mean_nis
 from eskf_ros.geodesy.map_frame import MapFrame
+from eskf_ros.inputs.table import uses_ranges
 from eskf_ros.parameters.tree import Parameters
 from eskf_ros.replay.run import Options, replay
 
@@ -99,6 +101,16 @@ def antenna_at(rows: NDArray[Any], stamp: int, parameters: Parameters) -> Array:
     return arm
 
 
+def compared(
+    recording: Recording, before: Parameters, after: Parameters, outage: tuple[float, float], truth: str = ""
+) -> dict[str, dict[str, Any]]:
+    """Return "before" and "after", each as of `figures_of`."""
+    return {
+        label: figures_of(recording, parameters, outage, truth)
+        for label, parameters in (("before", before), ("after", after))
+    }
+
+
 def figures_of(
     recording: Recording, parameters: Parameters, outage: tuple[float, float], truth: str = ""
 ) -> dict[str, Any]:
@@ -113,6 +125,7 @@ def figures_of(
     }
     if truth and recording.path is not None:
         with tempfile.TemporaryDirectory(prefix="eskf_calibrate-") as folder:
-            summary = replay(recording.path, parameters, Options(Path(folder) / "results", truth=truth))
+            used = with_ranges(parameters, given) if uses_ranges(given := recording.parameters) else parameters
+            summary = replay(recording.path, used, Options(Path(folder) / "results", truth=truth))
         found |= {"nees": summary["nees"], "error": summary["error"]}
     return found

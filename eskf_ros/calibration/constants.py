@@ -209,8 +209,8 @@ def places_of(parameters: Parameters, constants: Collection[Constant]) -> list[i
 def changed(parameters: Parameters, corrections: Mapping[str, float]) -> Parameters:
     """Return the parameters with ``corrections`` by name of the constant, in the units of the states.
 
-    Yaw and pitch of the vehicle's axes in base_link make these axes the new base_link: IMU and, if it is among the
-    corrections, the antenna are described anew in it, as they are where they were.
+    Yaw and pitch of the vehicle's axes in base_link make these axes the new base_link: IMU and, where they are among
+    the corrections, antenna and baseline of a dual antenna are described anew in it, as they are where they were.
     """
     values: dict[str, Any] = dict(to_mapping(parameters))
     for constant in CONSTANTS:
@@ -232,6 +232,9 @@ def changed(parameters: Parameters, corrections: Mapping[str, float]) -> Paramet
             mount = np.array(values["imu.mount_position"])
             arm = vehicle_to_base.inv().apply(np.array(values["gnss.lever_arm"]) - mount)
             values["gnss.lever_arm"] = (mount + arm).tolist()
+        if "heading_offset" in corrections:
+            baseline_to_base = Rotation.from_matrix(to_base(tuple(values["heading.mount_rpy_deg"])))
+            values["heading.mount_rpy_deg"] = rpy_deg(vehicle_to_base.inv() * baseline_to_base)
     return from_mapping(values)
 
 

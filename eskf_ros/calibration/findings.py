@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,8 +14,7 @@ from numpy.typing import NDArray
 from eskf_ros.calibration.coarse_mounting import CoarseMounting
 from eskf_ros.calibration.combine import Combined
 from eskf_ros.calibration.constants import Constant, value_of
-from eskf_ros.calibration.noise import rest_and_road
-from eskf_ros.calibration.recording import Pass, Recording
+from eskf_ros.calibration.recording import Look, Pass
 from eskf_ros.calibration.roll import SHOWN_BY as ROLL_SHOWN_BY
 from eskf_ros.calibration.roll import Roll
 from eskf_ros.parameters.mapping import from_mapping, to_mapping
@@ -146,9 +146,9 @@ def roll_finding(current: Parameters, roll: Roll, coarse: CoarseMounting | None)
     return Finding("mounting_roll", "imu.mount_rpy_deg", 0, value, value, std, "deg", roll.is_known, text)
 
 
-def noise_findings(given: Sequence[Recording], parameters: Parameters) -> list[Finding]:
+def noise_findings(looks: Sequence[Look], parameters: Parameters) -> list[Finding]:
     """Return the noise densities of the IMU, for those parameters that are at their defaults."""
-    seen = [rest_and_road(recording.tables) for recording in given]
+    seen = [(look.rest, look.road) for look in looks]
     found = []
     for name, unit in (("gyro", "rad/s/rtHz"), ("accel", "m/s2/rtHz")):
         key = f"{name}_noise_density"
@@ -176,6 +176,19 @@ def with_noise(parameters: Parameters, noises: Sequence[Finding]) -> Parameters:
     values: dict[str, Any] = dict(to_mapping(parameters))
     values |= {finding.parameter: finding.value for finding in noises if finding.is_shown}
     return from_mapping(values)
+
+
+def findings_of_ranges(findings: Sequence[Finding], given: Parameters) -> list[Finding]:
+    """Return the findings with the time offset as that of the ranges."""
+    found = []
+    for finding in findings:
+        if finding.name == "time_offset":
+            offset = given.ranges.time_offset
+            before, value = finding.before + offset, finding.value + offset
+            found.append(dataclasses.replace(finding, parameter="ranges.time_offset", before=before, value=value))
+        elif finding.name != "velocity_time_offset":
+            found.append(finding)
+    return found
 
 
 LEFT_TO_THE_NODE: dict[str, dict[str, Any]] = {

@@ -7,11 +7,23 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from eskf_ros.fleet.command import add_options, is_fleet
+from eskf_ros.fleet.recordings import RESULTS, find
+from eskf_ros.fleet.stopping import Stopped, stoppable
+
+if TYPE_CHECKING:
+    from eskf_ros.calibration.fleet import Rounds
 
 _EPILOG = """\
 One installation, one or several recordings of it: fixes, velocities and, as far as there are, wheels and a dual
 antenna. Drive turns to both sides, speed up and brake. docs/calibrate.md says what shows what.
-exit code: 0 done, 2 a recording cannot be read or the command was mistaken.
+
+A folder of recordings, or --jobs or --dask, makes a fleet: each pass works on N recordings at a time, with the result
+of one process. A recording that cannot be read is named and left out. What is finished lies in FILE_eskf/ (without
+.yaml): after a stop the same command goes on from there, and its fleet.json has a row for each recording.
+exit code: 0 done, 2 a recording cannot be read or the command was mistaken, 130 after Ctrl-C.
 """
 
 
@@ -23,7 +35,9 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 directory, .mcap or .db3 file")
+    parser.add_argument(
+        "bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 directory, .mcap or .db3 file, or a folder of such"
+    )
     parser.add_argument("--config", type=Path, metavar="FILE", help="parameter file of the node: what is known so far")
     parser.add_argument(
         "--out",
@@ -51,27 +65,30 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--json", metavar="FILE", help="write the results here too; - is stdout, tables go to stderr")
     parser.add_argument("--quiet", action="store_true", help="no progress and no tables; warnings and errors only")
+    add_options(parser)
     return parser
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; return the exit code: 0, 2, 130 after Ctrl-C."""
+    """Run the command; return the exit code: 0, 2, 130 after Ctrl-C, 143 after `kill`."""
     options = _parser().parse_args(arguments)
     from eskf_ros.bags import BagError
+    from eskf_ros.fleet.dask_cluster import ClusterError
     from eskf_ros.parameters.schema import ParameterError
     from eskf_ros.replay.topics import InputError
 
     try:
-        return _static(options) if options.static else _calibrate(options)
-    except (BagError, InputError, ParameterError, ValueError) as error:
+        with stoppable():
+            return _static(options) if options.static else _calibrate(options)
+    except (BagError, ClusterError, InputError, ParameterError, ValueError) as error:
         return _mistake("; ".join(str(error).splitlines()))
     except ImportError as error:
         return _mistake(f"{error.name} is missing: pip install 'eskf_ros[calibrate]'")
     except OSError as error:
         return _mistake(f"{error.filename or options.bags[0]}: {error.strerror or error}")
-    except KeyboardInterrupt:
-        _say("interrupted; nothing is written")
-        return 130
+    except Stopped as stopped:
+        _say(f"interrupted; {options.out} is not written")
+        return 128 + stopped.number
 
 
 def _calibrate(options: argparse.Namespace) -> int:
@@ -79,23 +96,38 @@ def _calibrate(options: argparse.Namespace) -> int:
 
     from eskf_ros.calibration.calibrate import calibrate
     from eskf_ros.calibration.report import as_dict, parameter_file, show
+    from eskf_ros.parameters.ros_yaml import load
+    from eskf_ros.parameters.tree import Parameters
 
+    parameters = load(options.config) if options.config else Parameters()
+    found = find(options.bags, _say)
+    rounds: Rounds | None = None
+    recordings: list[Any] = [one.path for one in found]
+    if found and is_fleet(found, options):
+        from eskf_ros.calibration.fleet import Rounds, recordings_of
+
+        recordings = recordings_of(found, parameters)
+        rounds = Rounds(options, options.out.with_name(options.out.stem + RESULTS), _say)
     calibration = calibrate(
-        options.bags,
-        options.config,
+        recordings,
+        parameters,
         options.vehicle,
         options.truth,
         not options.no_comparison,
+        each=map if rounds is None else rounds,
         say=(lambda text: None) if options.quiet else _say,
     )
+    options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(parameter_file(calibration), encoding="utf-8")
     _write_json(options, as_dict(calibration))
     for warning in calibration.warnings:
         _say(f"warning: {warning}")
     if not options.quiet:
-        show(calibration, Console(stderr=options.json == "-"))
+        show(calibration, Console(stderr=options.json == "-"), is_compared=rounds is None)
+        if rounds is not None:
+            rounds.show()
         _say(f"written: {options.out}")
-    return 0
+    return 2 if rounds is not None and rounds.failed else 0
 
 
 def _static(options: argparse.Namespace) -> int:

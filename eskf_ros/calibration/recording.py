@@ -1,9 +1,10 @@
-"""A recording in memory, and one pass of the filter over it with the constants as states."""
+"""A recording, what it shows at first sight, and one pass of the filter over it with the constants as states."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
+from functools import lru_cache
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from eskf_ros.api import Filter
+from eskf_ros.calibration.coarse_mounting import CoarseMounting, coarse_mounting
 from eskf_ros.calibration.constants import Constant, places_of
+from eskf_ros.calibration.noise import Density, rest_and_road
+from eskf_ros.calibration.ranges import read_tables
 from eskf_ros.calibration.roll import ROW_RATE, Roll, roll_of
 from eskf_ros.filter.state.error_state import ERROR_SIZE
 from eskf_ros.parameters.tree import Parameters
-from eskf_ros.tables.bag import read_bag
 
 Array = NDArray[np.float64]
 Tables = Mapping[str, Any]
@@ -24,16 +27,59 @@ Tables = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Recording:
-    """The tables of a recording as `eskf_ros.run` takes them, stamps as int64 ns, and where it comes from."""
+    """One recording: tables in memory (``held``), or the ``path`` they are read from, with topics of ``parameters``.
+
+    What is read is not part of it: it can be sent to another process, and a hundred of them need the memory of one.
+    """
 
     name: str
-    tables: Tables
+    held: Tables | None = None
     path: Path | None = None
+    parameters: Parameters = field(default_factory=Parameters)
 
     @property
-    def inputs(self) -> set[str]:
-        """Names of the inputs that have messages."""
-        return {name for name, table in self.tables.items() if len(table["stamp"])}
+    def tables(self) -> Tables:
+        """The tables as `eskf_ros.run` takes them, stamps as int64 ns; raises BagError or InputError."""
+        if self.held is not None:
+            return self.held
+        assert self.path is not None
+        return _read(self.path, self.parameters)
+
+
+@lru_cache(maxsize=1)
+def _read(path: Path, parameters: Parameters) -> Tables:
+    return read_tables(path, parameters)
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a recording shows without the filter: its inputs, noise at rest and on the road, mounting of the IMU."""
+
+    inputs: tuple[str, ...]
+    rest: Density | None
+    road: Density | None
+    coarse: CoarseMounting | None
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> Look:
+        """Return what `as_dict` has told."""
+        rest, road = (Density(**content[key]) if content[key] else None for key in ("rest", "road"))
+        coarse = content["coarse"]
+        if coarse:
+            coarse = CoarseMounting(**coarse | {"quaternion": tuple(coarse["quaternion"])})
+        return cls(tuple(content["inputs"]), rest, road, coarse)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all of it as JSON has it, exactly."""
+        return asdict(self)
+
+
+def look_at(recording: Recording, may_be_vehicle: bool) -> Look:
+    """Return what a recording shows without the filter; the mounting only where it ``may_be_vehicle``."""
+    tables = recording.tables
+    coarse = coarse_mounting(tables) if may_be_vehicle else None
+    inputs = sorted(name for name, table in tables.items() if len(table["stamp"]))
+    return Look(tuple(inputs), *rest_and_road(tables), coarse)
 
 
 @dataclass(frozen=True)
@@ -51,16 +97,25 @@ class Pass:
     roll: Roll
     restarts: int
 
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> Pass:
+        """Return what `as_dict` has told."""
+        arrays = {key: np.array(content[key], float) for key in ("correction", "covariance", "prior_std")}
+        roll = Roll(*(tuple(content["roll"][key]) for key in ("by_turns", "by_road")))
+        return cls(**arrays, nis=content["nis"], roll=roll, restarts=content["restarts"])
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all of it as JSON has it, exactly."""
+        arrays = {key: getattr(self, key).tolist() for key in ("correction", "covariance", "prior_std")}
+        return asdict(self) | arrays
+
 
 def as_recording(source: Any, parameters: Parameters) -> Recording:
-    """Return a recording in memory from a path, from tables as `eskf_ros.run` takes them, or as it is.
-
-    Raises BagError or InputError for a path that cannot be used.
-    """
+    """Return a recording from a path, from tables as `eskf_ros.run` takes them, or as it is."""
     if isinstance(source, Recording):
         return source
     if isinstance(source, str | PathLike):
-        return Recording(Path(source).name, read_bag(source, parameters), Path(source))
+        return Recording(Path(source).name, path=Path(source), parameters=parameters)
     return Recording("tables", dict(source))
 
 

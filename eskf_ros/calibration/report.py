@@ -71,14 +71,14 @@ def as_dict(calibration: Calibration) -> dict[str, Any]:
     }
 
 
-def show(calibration: Calibration, console: Console) -> None:
-    """Print the values, and the comparison of before and after."""
+def show(calibration: Calibration, console: Console, is_compared: bool = True) -> None:
+    """Print the values, and the comparison of before and after recording by recording."""
     table = Table("", "before", "found", "sigma", "unit", "", box=box.SIMPLE_HEAD, pad_edge=False)
     for finding in calibration.findings:
         shown = (f"{finding.value:.5g}", f"{finding.std:.2g}") if finding.is_shown else ("-", "-")
         table.add_row(finding.name, f"{finding.before:.5g}", *shown, finding.unit, finding.text)
     console.print(table, highlight=False)
-    if calibration.figures:
+    if calibration.figures and is_compared:
         console.print(comparison(calibration), highlight=False)
 
 

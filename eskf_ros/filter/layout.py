@@ -204,6 +204,7 @@ WORK = np.dtype(
         ("solution_covariance", "f8", (3, 3)),
         ("shared", "f8", (3, ERROR_CAPACITY)),
         ("holds_heading", "i8"),
+        ("heading_offset_at", "i8"),
         ("projected", "f8", (3, ERROR_CAPACITY)),
         ("innovation_covariance", "f8", (3, 3)),
         ("noise_seen", "f8", (3, 3)),
@@ -231,7 +232,8 @@ WORK = np.dtype(
 
 - ``half``, ``turned``: the covariance after one side of the transition, and its transpose.
 - ``jacobian``, ``innovation``, ``noise``: the measurement to fuse; ``shared``: covariance of its noise with the errors,
-  zero unless the measurement writes it; ``holds_heading``: 1 for GNSS, which shows the heading by accelerations alone.
+  zero unless the measurement writes it; ``holds_heading``: 1 for GNSS, which shows the heading by accelerations
+  alone, and with it the error at ``heading_offset_at``.
 - ``projected`` ... ``correction``: intermediate results of the update.
 - ``effect``, ``fault_covariance``: derivative of the measurement by the faults of its receiver, and the covariance of
   these (`installation_monitor`).

@@ -55,7 +55,7 @@ def run_command(
     file = folder / FILE
     with watching(len(tasks), say, options.quiet) as watch:
         try:
-            content = run_fleet(job, tasks, _backend(options), file, options.again, watch)
+            content = run_fleet(job, tasks, backend_of(options), file, options.again, watch)
         except Exception:
             raise
         except BaseException:  # However the command takes Ctrl-C.
@@ -66,7 +66,8 @@ def run_command(
     return content
 
 
-def _backend(options: argparse.Namespace) -> Backend:
+def backend_of(options: argparse.Namespace) -> Backend:
+    """Return the workers that --jobs or --dask asks for; raises ClusterError (`dask_cluster`)."""
     if options.dask:
         from eskf_ros.fleet.dask_cluster import on_dask
 

@@ -23,28 +23,25 @@ PERIOD = 10.0
 
 @contextmanager
 def watching(count: int, say: Callable[[str], None], quiet: bool) -> Iterator[Watch]:
-    """Show progress over all `count` recordings, and say at once which failed."""
+    """Show progress over all `count` recordings, and say at once which failed, and what was warned of."""
     told = 0
 
-    def errors(outcomes: Sequence[Outcome]) -> None:
+    def news(outcomes: Sequence[Outcome]) -> None:
         nonlocal told
         for outcome in outcomes[told:]:
-            if outcome.error:
-                say(
-                    f"error: {outcome.error}"
-                    + ("" if outcome.task.name in outcome.error else f" ({outcome.task.name})")
-                )
+            for sentence in _sentences(outcome):
+                say(sentence if outcome.task.name in sentence else f"{sentence} ({outcome.task.name})")
         told = len(outcomes)
 
     if quiet:
-        yield lambda outcomes, shares: errors(outcomes)
+        yield lambda outcomes, shares: news(outcomes)
         return
     if not sys.stderr.isatty():
         last = began = time.monotonic()
 
         def lines(outcomes: Sequence[Outcome], shares: Mapping[str, float]) -> None:
             nonlocal last
-            errors(outcomes)
+            news(outcomes)
             now = time.monotonic()
             if now - last > PERIOD:
                 last = now
@@ -60,10 +57,21 @@ def watching(count: int, say: Callable[[str], None], quiet: bool) -> Iterator[Wa
         row = bar.add_task("starting", total=count)
 
         def move(outcomes: Sequence[Outcome], shares: Mapping[str, float]) -> None:
-            errors(outcomes)
+            news(outcomes)
             bar.update(row, description=_counted(outcomes, count), completed=len(outcomes) + sum(shares.values()))
 
         yield move
+
+
+def _sentences(outcome: Outcome) -> list[str]:
+    """Return what is said of a recording: its error, or the first of its warnings, if it was done just now."""
+    if outcome.error:
+        return [f"error: {outcome.error}"]
+    warnings = outcome.figures.get("warnings") or []
+    if outcome.state != "done" or not warnings:
+        return []
+    more = f"; and {len(warnings) - 1} more in fleet.json" if len(warnings) > 1 else ""
+    return [f"warning: {warnings[0]}{more}"]
 
 
 def _counted(outcomes: Sequence[Outcome], count: int) -> str:

@@ -17,8 +17,10 @@ from calibration import tables_of
 from eskf_ros.calibration.calibrate import calibrate
 from eskf_ros.calibration.findings import Calibration
 from eskf_ros.calibration.main import main
+from eskf_ros.calibration.recording import run_pass
 from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.parameters.ros_yaml import load
+from eskf_ros.simulate.dual_antenna import DualAntenna
 from eskf_ros.simulate.main import main as simulate_bag
 from eskf_ros.simulate.scenario import simulate
 from eskf_ros.simulate.wheel import WheelOdometer
@@ -26,6 +28,9 @@ from eskf_ros.simulate.wheel import WheelOdometer
 LEVER_ARM = (0.8, -0.2, 1.4)
 MOUNT = (-150.0, 40.0, 75.0)
 OFFSETS = (-0.08, -0.13, -0.04)
+HEADING_OFFSET = 2.5
+"""deg"""
+
 RTK: dict[str, Any] = {"grade": "consumer", "imu_rate": 50.0, "position_std": (0.02, 0.03)}
 
 
@@ -89,6 +94,71 @@ def test_a_boat_is_asked_for_its_antenna_only() -> None:
         assert not finding.is_shown or abs(finding.value - value) < 4.0 * finding.std, finding
 
 
+def dual_antenna_tables(name: str, seed: int, **options: Any) -> dict[str, Any]:
+    """A recording with a dual antenna whose second antenna is `HEADING_OFFSET` beside the front."""
+    angle = math.radians(HEADING_OFFSET)
+    sensor = DualAntenna(baseline=(math.cos(angle), math.sin(angle), 0.0))
+    return tables_of(simulate(name, seed, **RTK | options, dual_antenna=sensor))
+
+
+@pytest.mark.parametrize(
+    ("seed", "is_vehicle", "std"), [(1, False, 0.02), (2, False, 1.0), (3, True, 0.02), (4, True, 1.0)]
+)
+def test_the_mounting_of_a_dual_antenna_is_found(seed: int, is_vehicle: bool, std: float) -> None:
+    # A vehicle's mounting of the IMU is found with it: base_link turns by 2 degrees, and the baseline with it.
+    mount = (0.0, 0.0, 2.0 if is_vehicle else 0.0)
+    tables = dual_antenna_tables("drive", seed, position_std=(std, 1.5 * std), imu_rpy_deg=mount)
+    found = calibrate(tables, is_vehicle=is_vehicle, compares=False)
+    finding = found.named("heading_offset")
+    assert finding.is_shown
+    error = found.parameters.heading.mount_rpy_deg[2] - HEADING_OFFSET
+    assert abs(error) < min(0.3, 3.0 * finding.std), (error, finding.std)
+    assert found.parameters.imu.mount_rpy_deg[2] == pytest.approx(mount[2], abs=0.3)
+
+
+@pytest.mark.parametrize("name", ["parked", "straight:15", "straight:30"])
+def test_the_mounting_of_a_dual_antenna_is_refused_without_accelerations(name: str) -> None:
+    parameters = from_mapping({"heading.mount_rpy_deg": [0.0, 0.0, 1.0]})
+    found = calibrate(dual_antenna_tables(name, 1, stop=200.0), parameters, is_vehicle=False, compares=False)
+    finding = found.named("heading_offset")
+    assert not finding.is_shown
+    assert "it takes accelerations" in finding.text
+    assert found.parameters.heading == parameters.heading
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_lever_arm_and_time_offset_of_ranges_are_found_in_mode_tight(tmp_path: Path, seed: int) -> None:
+    bag = tmp_path / "drive.mcap"
+    arguments = ["drive", "--out", str(bag), "--seed", str(seed), "--imu-rate", "50", "--sensor", "ranges", "--quiet"]
+    assert simulate_bag([*arguments, "--set", "lever_arm=0.8/-0.2/1.4"]) == 0
+    # The stamps are right: what is configured is what is wrong with them.
+    given = from_mapping({"mode": "tight", "ranges.time_offset": 0.1, "gnss.time_offset": 0.5})
+    found = eskf_ros.calibrate(bag, given, is_vehicle=False, compares=False)
+    assert found.parameters.mode == "tight"
+    assert found.parameters.gnss.time_offset == 0.5
+    for name, value, bound in (("lever_arm_x", 0.8, 0.05), ("lever_arm_y", -0.2, 0.05), ("time_offset", 0.0, 0.003)):
+        finding = found.named(name)
+        assert finding.is_shown, finding
+        assert abs(finding.value - value) < min(bound, 3.0 * finding.std), finding
+    assert found.named("time_offset").parameter == "ranges.time_offset"
+    assert found.parameters.ranges.time_offset == pytest.approx(found.named("time_offset").value)
+    np.testing.assert_allclose(found.parameters.gnss.lever_arm[0], found.named("lever_arm_x").value)
+
+
+def test_mode_tight_without_ranges_is_refused_with_what_to_do(
+    tmp_path: Path, fleet: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "tight.yaml"
+    config.write_text("/**:\n  ros__parameters:\n    mode: tight\n")
+    bag = str(fleet / "day_1" / "drive.mcap")
+    assert main([bag, "--config", str(config), "--out", str(tmp_path / "found.yaml")]) == 2
+    error = capsys.readouterr().err
+    assert "no topic gnss/ranges" in error
+    assert "eskf_ranges writes those" in error
+    with pytest.raises(ValueError, match="tables have no ranges"):
+        calibrate(tables_of(simulate("drive", 1, **RTK, stop=20.0)), from_mapping({"mode": "tight"}))
+
+
 def test_several_recordings_are_better_than_one_and_may_run_side_by_side() -> None:
     drives = [tables_of(simulate("drive", seed, **RTK, stop=100.0), OFFSETS) for seed in (1, 2)]
     parameters = from_mapping({"gnss.lever_arm": list(LEVER_ARM)})
@@ -113,6 +183,82 @@ def test_the_command_writes_a_file_for_the_node(tmp_path: Path, capsys: pytest.C
     content = json.loads((tmp_path / "found.json").read_text())
     assert {finding["name"] for finding in content["findings"]} >= {"lever_arm_x", "mounting_roll", "gyro_noise"}
     assert math.isfinite(content["figures"]["after"][0]["nees"]["position"]["mean"])
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of two drives, in folders of their own, and of a file that was cut off."""
+    folder = tmp_path_factory.mktemp("fleet")
+    for seed in (1, 2):
+        (folder / f"day_{seed}").mkdir()
+        arguments = ["drive", "--out", str(folder / f"day_{seed}" / "drive.mcap"), "--seed", str(seed), "--quiet"]
+        assert simulate_bag([*arguments, "--imu-rate", "50", "--set", "stop=100"]) == 0
+    (folder / "cut.mcap").write_bytes((folder / "day_1" / "drive.mcap").read_bytes()[:100])
+    return folder
+
+
+def assert_as_one_process(out: Path, fleet: Path) -> None:
+    drives = [str(fleet / f"day_{seed}" / "drive.mcap") for seed in (1, 2)]
+    alone = out.parent / "alone"
+    assert main([*drives, "--out", str(alone / "one.yaml"), "--json", str(alone / "one.json"), "--quiet"]) == 0
+    found, expected = (json.loads(file.with_suffix(".json").read_text()) for file in (out, alone / "one.yaml"))
+    assert found | {"recordings": expected["recordings"]} == expected
+    assert out.read_text().splitlines()[1:] == (alone / "one.yaml").read_text().splitlines()[1:]
+
+
+def test_a_folder_on_two_processes_gives_the_file_of_one(
+    tmp_path: Path, fleet: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "new" / "found.yaml"
+    command = [str(fleet), "--out", str(out), "--json", str(out.with_suffix(".json")), "--jobs", "2"]
+    assert main(command) == 2
+    text = capsys.readouterr()
+    assert "cut.mcap" in text.err
+    assert "2 recordings: 2 done" in text.out
+    rounds = out.with_name("found_eskf")
+    states = [entry["state"] for entry in json.loads((rounds / "fleet.json").read_text())["recordings"]]
+    assert states == ["done", "done"]
+    assert_as_one_process(out, fleet)
+    # The same command finds all done; after a stop, what was not.
+    first = out.read_bytes()
+    (rounds / "round_2" / "day_2" / "drive.mcap.json").unlink()
+    assert main(command) == 2
+    assert "2 recordings: 2 skipped" in capsys.readouterr().out
+    assert out.read_bytes() == first
+    assert main([*command, "--quiet", "--vehicle"]) == 2
+    assert out.read_bytes() != first
+
+
+@pytest.mark.slow
+def test_a_dask_cluster_gives_the_file_of_one_process(tmp_path: Path, fleet: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    out = tmp_path / "found.yaml"
+    drives = [str(fleet / f"day_{seed}") for seed in (1, 2)]
+    command = [*drives, "--out", str(out), "--json", str(out.with_suffix(".json")), "--quiet"]
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as two_workers:
+        assert main([*command, "--dask", two_workers.scheduler_address]) == 0
+    assert_as_one_process(out, fleet)
+
+
+def test_one_recording_that_is_given_twice_is_a_mistake(
+    tmp_path: Path, fleet: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = str(fleet / "day_1" / "drive.mcap")
+    assert main([bag, bag, "--jobs", "2", "--out", str(tmp_path / "found.yaml")]) == 2
+    assert "drive.mcap is given 2 times" in capsys.readouterr().err
+
+
+def test_a_recording_that_fails_in_a_pass_is_left_out_of_the_rest() -> None:
+    drives = [tables_of(simulate("drive", seed, **RTK, stop=100.0), OFFSETS) for seed in (1, 2)]
+
+    def second_fails(step: Any, recordings: Any) -> list[Any]:
+        return [None if k == 1 and step.func is run_pass else step(one) for k, one in enumerate(recordings)]
+
+    without = calibrate(drives, is_vehicle=False, compares=False, each=second_fails)
+    assert len(without.recordings) == 1
+    assert all("of 2 recordings" not in finding.text for finding in without.findings)
+    with pytest.raises(ValueError, match="no recording that can be used"):
+        calibrate(drives, is_vehicle=False, compares=False, each=lambda step, recordings: [None for _ in recordings])
 
 
 def test_mistakes_are_one_line_and_exit_code_two(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

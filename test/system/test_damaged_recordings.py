@@ -17,6 +17,7 @@ import pytest
 from damaged_recordings import FAILURES, run, whole_results
 from eskf_ros.bags import BagError, open_bag
 from eskf_ros.gnss.cloud import number_column
+from eskf_ros.replay.main import main as eskf_replay
 from support.damage import Files, recordings, write
 
 IMU, FIX = "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix"
@@ -158,7 +159,20 @@ def test_a_satellite_with_a_signalling_nan() -> None:
     assert column[[0, 2]].tolist() == [0.0, 0.0]
 
 
-@pytest.mark.xfail(reason="one of two cut .mcap files in a folder: its missing messages are not said", strict=False)
+def test_a_cut_file_in_a_folder_of_recordings_is_said(
+    tmp_path: Path, sound: dict[str, Files], capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = dict(sound["two mcap files"])
+    files["a.mcap"] = files["a.mcap"][:20_000]
+    recording = tmp_path / "drives"
+    recording.mkdir()
+    assert eskf_replay([str(write(files, recording)), "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    (of_a,) = [line for line in capsys.readouterr().err.splitlines() if "a.mcap" in line]
+    assert of_a.startswith("eskf_replay: warning: ")
+    assert "cut off at byte" in of_a
+    assert "the messages before it are used" in of_a
+
+
 @pytest.mark.slow
 def test_a_part_of_the_campaign(sound: dict[str, Files]) -> None:
     whole = whole_results(sound)

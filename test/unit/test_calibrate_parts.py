@@ -97,9 +97,11 @@ def test_another_base_link_leaves_imu_and_antenna_where_they_are() -> None:
         "imu.mount_rpy_deg": [20.0, -10.0, 70.0],
         "imu.mount_position": [0.2, 0.1, 0.3],
         "gnss.lever_arm": [1.0, -0.5, 1.2],
+        "heading.mount_rpy_deg": [0.0, 5.0, 90.0],
     }
     before = from_mapping(given)
-    corrections = {"mounting_roll": 0.02, "mounting_pitch": -0.03, "mounting_yaw": 0.1, "lever_arm_x": 0.0}
+    corrections = {"mounting_roll": 0.02, "mounting_pitch": -0.03, "mounting_yaw": 0.1}
+    corrections |= {"lever_arm_x": 0.0, "heading_offset": 0.0}
     after = changed(before, corrections)
     to_old = Rotation.from_euler("xyz", before.imu.mount_rpy_deg, degrees=True)
     to_new = Rotation.from_euler("xyz", after.imu.mount_rpy_deg, degrees=True)
@@ -111,6 +113,12 @@ def test_another_base_link_leaves_imu_and_antenna_where_they_are() -> None:
         for turn, parameters in ((to_old, before), (to_new, after))
     ]
     np.testing.assert_allclose(arms[1], arms[0], atol=1e-9)
+    lines = [
+        turn.inv() * Rotation.from_euler("xyz", parameters.heading.mount_rpy_deg, degrees=True)
+        for turn, parameters in ((to_old, before), (to_new, after))
+    ]
+    assert (lines[0].inv() * lines[1]).magnitude() < 1e-9
+    assert changed(before, {"mounting_yaw": 0.1}).heading == before.heading
 
 
 def test_each_constant_is_a_state_of_its_own() -> None:

@@ -177,3 +177,12 @@ def test_vibration_that_sets_in_is_no_shock_for_long() -> None:
     values[3000:] += np.repeat([15.0, 1.5], 3) * rng.normal(size=(3000, 6))
     _, widened = run(values)
     assert np.flatnonzero(widened).max() < 3200
+
+
+def test_a_swing_about_the_mean_is_no_shock_but_a_step_as_large_is() -> None:
+    """A pothole swings the pitch rate by 1.1 rad/s from one sample to the next, 0.55 rad/s to each side of the mean."""
+    swing, step = readings(40.0), readings(40.0)
+    swing[3000:3006, 4] += np.array([0.55, -0.55, -0.3, 0.55, -0.4, 0.1])
+    step[3000:3010, 4] += 1.1
+    assert not run(swing)[1].any()
+    assert run(step)[1][3000:3010].all()

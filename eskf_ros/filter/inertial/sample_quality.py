@@ -7,7 +7,8 @@ attitude along that axis grows with the square of the time, over exactly that ti
 
 - All axes on a line for longer than ``imu.gap``: a hole that a driver has filled. It costs what a hole costs.
 - One axis that keeps a value: clipped if the value is the largest or smallest ever read, else stuck.
-- A jump from one sample to the next that is far beyond all changes before: a shock that the sensor may not follow.
+- A jump from one sample to the next, away from the mean of late, that is far beyond all changes before: a shock that
+  the sensor may not follow.
 
 While the robot seems to stand nothing is widened: there a reading may well stay the same.
 """
@@ -178,7 +179,8 @@ def judge_sample(state, sample, instant, settings):
         equal += is_equal
         on_line += bend <= ON_LINE * quality.bend[i]
         noisy += quality.bend[i] > NOISY * quality.change[i]
-        jumps += change * change > max(quality.least_jump[i], OUTLIER * quality.change[i])
+        jump = jump_of(state, sample, i)
+        jumps += jump * jump > max(quality.least_jump[i], OUTLIER * quality.change[i])
         learn(quality, i, read(sample, i), change, bend, is_equal, weight)
     if equal > 0 or quality.any_equal == 1:
         count_equal(state, quality, sample, interval)
@@ -214,6 +216,17 @@ def read(sample, i):
 def last_reading(state, i):
     """Return the last reading of an axis."""
     return state.imu.force[i] if i < 3 else state.imu.rate[i - 3]
+
+
+@njit
+def jump_of(state, sample, i):
+    """Return by how much an axis has left both its last reading and its mean of late.
+
+    A vibration swings from one side of the mean to the other: that is twice as far as it leaves the mean.
+    """
+    mean = state.imu.smooth_force[i] if i < 3 else state.imu.smooth_rate[i - 3]
+    new = read(sample, i)
+    return min(abs(new - last_reading(state, i)), abs(new - mean))
 
 
 @njit
@@ -278,12 +291,11 @@ def watch_shock(state, quality, sample, interval):
         largest = 0.0
         for i in range(6):
             quality.shock_level[i] = last_reading(state, i)
-            change = read(sample, i) - quality.shock_level[i]
-            share = change * change / quality.least_jump[i]
+            share = jump_of(state, sample, i) ** 2 / quality.least_jump[i]
             if share > largest:
                 largest = share
                 quality.shock_axis = i
-                quality.shock_size = abs(change)
+                quality.shock_size = abs(read(sample, i) - quality.shock_level[i])
     begin = quality.shock_time
     quality.shock_time = begin + interval
     for i in range(6):

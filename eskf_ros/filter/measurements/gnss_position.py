@@ -21,7 +21,13 @@ from eskf_ros.filter.measurements.antenna import (
     set_lever_arm,
     time_offset_blocks,
 )
-from eskf_ros.filter.measurements.jacobians import clear, set_east_north_up_covariance, set_identity, set_minus_cross
+from eskf_ros.filter.measurements.jacobians import (
+    clear,
+    let_heading_be_held,
+    set_east_north_up_covariance,
+    set_identity,
+    set_minus_cross,
+)
 from eskf_ros.filter.measurements.row import NEEDS_LEVEL, OptionalBlock, Row, threefold
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, POSITION
@@ -114,7 +120,7 @@ def linearize(state, payload, source, settings, work):
 @njit
 def linearize_antenna(state, measured, source, settings, work):
     """Write innovation and Jacobian of a position (m, map) of the antenna of ``source`` to ``work``, which is clear."""
-    work.holds_heading = 1
+    let_heading_be_held(work, settings)
     predicted = predict(state, source, settings)
     for i in range(3):
         work.innovation[i] = measured[i] - predicted[i]

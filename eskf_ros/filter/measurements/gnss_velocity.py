@@ -14,7 +14,13 @@ import numpy.typing as npt
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import body_rate, local_east_north_up_to_ecef
 from eskf_ros.filter.measurements.antenna import antenna_velocity, carry_velocity, lever_arm_of, set_lever_arm
-from eskf_ros.filter.measurements.jacobians import clear, set_east_north_up_covariance, set_identity, set_minus_cross
+from eskf_ros.filter.measurements.jacobians import (
+    clear,
+    let_heading_be_held,
+    set_east_north_up_covariance,
+    set_identity,
+    set_minus_cross,
+)
 from eskf_ros.filter.measurements.row import (
     BARE_TWIST,
     HIGHEST_SPEED,
@@ -70,7 +76,7 @@ def linearize_antenna(state, measured, source, settings, work):
 
     Its noise is there; the noise of the gyro, which is part of the prediction, is added to it.
     """
-    work.holds_heading = 1
+    let_heading_be_held(work, settings)
     predicted = predict(state, source, settings)
     for i in range(3):
         work.innovation[i] = measured[i] - predicted[i]

@@ -23,6 +23,13 @@ def clear(work):
 
 
 @njit
+def let_heading_be_held(work, settings):
+    """Let the update hold the heading where nothing shows it: of GNSS, which sees it by accelerations alone."""
+    work.holds_heading = 1
+    work.heading_offset_at = settings.heading_offset_at
+
+
+@njit
 def set_identity(jacobian, column):
     """Write a 3x3 identity block from ``column`` on."""
     for i in range(3):

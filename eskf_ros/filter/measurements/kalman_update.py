@@ -89,11 +89,12 @@ def is_heading_shown(state):
 
 @njit
 def hold_heading(state, size, work):
-    """Take the heading and the gyro bias about the vertical, whose integral it is, out of the gain in ``work``.
+    """Take the heading, the gyro bias about the vertical, whose integral it is, and the offset of a heading sensor,
+    which is known through the heading alone, out of the gain in ``work``.
 
     GNSS does not see them while no acceleration stands out (`credible_force`) and nothing turns. What the linearised
     filter would learn all the same, it learns from its own corrections: lever arm, Earth rate and biases turn with the
-    estimate, and with them what is unobservable. Both errors still count in the covariance of the innovation (Schmidt,
+    estimate, and with them what is unobservable. These errors still count in the covariance of the innovation (Schmidt,
     Application of state-space methods to navigation problems, 1966).
     """
     up = local_up(state)
@@ -106,6 +107,8 @@ def hold_heading(state, size, work):
         for i in range(3):
             work.gain[ATTITUDE + i, a] -= turn * up[i]
             work.gain[GYRO_BIAS + i, a] -= drift * up_body[i]
+        if work.heading_offset_at < state.error_size:
+            work.gain[work.heading_offset_at, a] = 0.0
 
 
 @njit

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.measurements.jacobians import clear
+from eskf_ros.filter.measurements.jacobians import clear, let_heading_be_held
 from eskf_ros.filter.measurements.row import OptionalBlock, Row
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, INTER_SYSTEM, NOWHERE, POSITION
@@ -124,7 +124,7 @@ def linearize(state, payload, source, settings, work):
     if not elevation >= settings.pseudorange.elevation_mask:
         return 0
     clear(work)
-    work.holds_heading = 1
+    let_heading_be_held(work, settings)
     work.innovation[0] = payload[MEASURED] - predicted
     work.noise[0, 0] = variance(payload, source, elevation, ionosphere, settings)
     lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[0])

@@ -13,7 +13,7 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import body_rate
-from eskf_ros.filter.measurements.jacobians import clear
+from eskf_ros.filter.measurements.jacobians import clear, let_heading_be_held
 from eskf_ros.filter.measurements.row import Row
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ATTITUDE, GYRO_BIAS, POSITION, VELOCITY
@@ -78,7 +78,7 @@ def linearize(state, payload, settings, work):
     if not elevation >= settings.pseudorange.elevation_mask:
         return 0
     clear(work)
-    work.holds_heading = 1
+    let_heading_be_held(work, settings)
     work.innovation[0] = payload[MEASURED] - predicted
     rotation = to_matrix(state.attitude)
     arm = settings.lever_arms_body[0]
