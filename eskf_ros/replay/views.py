@@ -109,7 +109,9 @@ class Views:
             return
         self._unreported = self._unreported[len(done) :]
         stamps = np.array([row["stamp"] for row in done], np.int64)
-        place = np.searchsorted(np.maximum.accumulate(stamps), self._uncounted["stamp"])  # the first row that counts the record
+        place = np.searchsorted(
+            np.maximum.accumulate(stamps), self._uncounted["stamp"]
+        )  # the first row that counts the record
         counted = self._uncounted[place < len(done)]
         new = np.zeros((len(done), *self._counts.shape), np.int64)
         np.add.at(new, (place[place < len(done)], counted["stream"], counted["verdict"]), 1)
