@@ -112,7 +112,7 @@ def calibrate(
     current, combined, passes, moved, roll, count = iterate(given, start, constants, is_vehicle, each, warnings, say)
     findings = findings_of(constants, start, current, combined, passes, moved)
     if is_vehicle:
-        findings.append(roll_finding(current, roll, coarse))
+        findings.append(roll_finding(start, current, roll, coarse))
     final = with_consequences(start_with(start, current, findings, moved, constants), findings)
     figures: dict[str, list[dict[str, Any]]] = {}
     if compares:
