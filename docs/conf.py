@@ -16,7 +16,7 @@ project = "eskf_ros"
 author = "eskf_ros maintainers"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinxcontrib.mermaid"]
 root_doc = "README"
-include_patterns = ["README.md", "CONTRIBUTING.md", "CHANGELOG.rst", "docs/**.md"]
+include_patterns = ["README.md", "CONTRIBUTING.md", "QUALITY_DECLARATION.md", "CHANGELOG.rst", "docs/**.md"]
 exclude_patterns = [".*", "build", "install", "log", "results", "shared"]
 
 PAGES = {
@@ -24,8 +24,9 @@ PAGES = {
     "Set up": ["profiles", "receivers", "tuning", "calibrate", "troubleshooting", "heading", "migrate", "nav2"],
     "More to use": ["api", "simulate", "smoother", "tight", "ranges", "views", "watch", "fleets"],
     "Learn": ["lessons/README", "lessons/*", "theory", "architecture"],
-    "How good it is": ["results", "trust", "consistency", "benchmarks", "peers"],
-    "Change it": ["developing", "add_a_measurement", "../CONTRIBUTING", "../CHANGELOG"],
+    "How good it is": ["results", "trust", "consistency", "benchmarks", "small_boards", "peers"],
+    "Change it": ["developing", "add_a_measurement", "releasing", "../CONTRIBUTING", "../CHANGELOG"],
+    "What it promises": ["../QUALITY_DECLARATION"],
 }
 """Pages below docs/ by chapter; a pattern stands for what it matches, and what is not there is left out."""
 

@@ -156,27 +156,33 @@ def _prune(module: str) -> None:
 
 
 @contextlib.contextmanager
-def while_compiling(tell: Callable[[int], None]) -> Iterator[None]:
+def while_compiling(tell: Callable[[int], None]) -> Iterator[Callable[[], float]]:
     """While this lasts, call ``tell`` after each function that was compiled, with their number so far.
 
-    What comes from the cache does not count.
+    What comes from the cache does not count. Gives a function that returns the seconds of compiling so far.
     """
+    seconds = 0.0
     if not COMPILED:
-        yield
+        yield lambda: seconds
         return
     from numba.core import event
 
     counts = itertools.count(1)
+    under_way: list[float] = []  # a function that is compiled may call for others
 
     class Listener(event.Listener):  # type: ignore[misc]
         def on_start(self, started: Any) -> None:
-            pass
+            under_way.append(time.monotonic())
 
         def on_end(self, ended: Any) -> None:
+            nonlocal seconds
+            began = under_way.pop()
+            if not under_way:
+                seconds += time.monotonic() - began
             tell(next(counts))
 
     with event.install_listener("numba:compile", Listener()):
-        yield
+        yield lambda: seconds
 
 
 def sentence_on_compiling(say: Callable[[str], None]) -> Callable[[int], None]:
@@ -188,10 +194,9 @@ def sentence_on_compiling(say: Callable[[str], None]) -> Callable[[int], None]:
         now = time.monotonic()
         if now - told > PROGRESS_PERIOD:
             told = now
-            share = min(99, 100 * count // USUAL_COUNT)
             say(
-                f"compiling the estimator: {count} functions in {now - started:.0f} s, about {share} % "
-                "(only the first start after an installation)"
+                f"compiling the estimator: {count} of about {max(count, USUAL_COUNT)} functions "
+                f"in {now - started:.0f} s (only the first start after an installation)"
             )
 
     return tell

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +36,13 @@ class Status(NamedTuple):
     values: Mapping[str, str]
 
 
+@lru_cache(maxsize=4096)
+def _string(text: str) -> bytes:
+    """Return a string, padded to four bytes: its length with the closing NUL, its bytes. Names come again and again."""
+    encoded = text.encode() + b"\x00"
+    return struct.pack("<I", len(encoded)) + encoded + bytes(-len(encoded) % 4)
+
+
 class _Message:
     """A message that grows field by field."""
 
@@ -46,28 +55,24 @@ class _Message:
         self.data += bytes(-(len(self.data) - 4) % size)
         self.data += struct.pack(f"<{len(values)}{code}", *values)
 
-    def string(self, text: str) -> None:
-        """Append a string: its length with the closing NUL, and its bytes."""
-        encoded = text.encode() + b"\x00"
-        self.numbers("I", len(encoded))
-        self.data += encoded
+    def strings(self, *texts: str) -> None:
+        """Append strings, the last one without the padding that only another number or string would need."""
+        self.data += bytes(-len(self.data) % 4) + b"".join(map(_string, texts))
+        del self.data[len(self.data) - (-len(texts[-1].encode()) - 1) % 4 :]
 
     def header(self, stamp: int, frame: str) -> None:
         """Append a std_msgs/Header; ``stamp`` in ns."""
         seconds, nanoseconds = divmod(stamp, 1_000_000_000)
-        self.numbers("i", seconds)
-        self.numbers("I", nanoseconds)
-        self.string(frame)
+        self.numbers("i", seconds, nanoseconds)
+        self.strings(frame)
 
     def status(self, status: Status) -> None:
         """Append a diagnostic_msgs/DiagnosticStatus."""
         self.numbers("B", status.level)
-        for text in (status.name, status.message, "eskf_ros"):
-            self.string(text)
+        self.strings(status.name, status.message, "eskf_ros")
         self.numbers("I", len(status.values))
-        for key, value in status.values.items():
-            self.string(key)
-            self.string(value)
+        if status.values:
+            self.strings(*chain.from_iterable(status.values.items()))
 
 
 def diagnostic_status(status: Status) -> bytes:
@@ -92,7 +97,7 @@ def transforms(stamps: NDArray[np.int64], frame: str, child: str, poses: NDArray
     message = _Message()
     message.numbers("I", 1)
     message.header(0, frame)
-    message.string(child)
+    message.strings(child)
     message.numbers("d", *(0.0,) * 7)
     rows = np.tile(np.frombuffer(bytes(message.data), np.uint8), (len(stamps), 1))
     # After the encapsulation and the count: seconds and nanoseconds; the pose is the end.

@@ -144,7 +144,7 @@ def calibrated(
     )
     findings = findings_of(constants, start, current, combined, passes, moved)
     if is_vehicle:
-        findings.append(roll_finding(current, roll, coarse))
+        findings.append(roll_finding(start, current, roll, coarse))
     final = with_consequences(start_with(start, current, findings, moved, constants), findings)
     figures: dict[str, list[dict[str, Any]]] = {}
     if compares:

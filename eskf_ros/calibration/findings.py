@@ -135,7 +135,7 @@ def evidence(constant: Constant, told: float, passes: Sequence[Pass], spread: fl
     return text
 
 
-def roll_finding(current: Parameters, roll: Roll, coarse: CoarseMounting | None) -> Finding:
+def roll_finding(start: Parameters, current: Parameters, roll: Roll, coarse: CoarseMounting | None) -> Finding:
     """Return the roll of the mounting, which no state of the filter shows (see `roll`)."""
     value = current.imu.mount_rpy_deg[0]
     std = math.degrees(roll.joint[1])
@@ -143,7 +143,8 @@ def roll_finding(current: Parameters, roll: Roll, coarse: CoarseMounting | None)
     if coarse is not None:
         coarse_rpy = ", ".join(f"{angle:.1f}" for angle in coarse.rotation.as_euler("xyz", degrees=True))
         text += f"; gravity and accelerations alone say roll, pitch, yaw {coarse_rpy}"
-    return Finding("mounting_roll", "imu.mount_rpy_deg", 0, value, value, std, "deg", roll.is_known, text)
+    before = start.imu.mount_rpy_deg[0]
+    return Finding("mounting_roll", "imu.mount_rpy_deg", 0, before, value, std, "deg", roll.is_known, text)
 
 
 def noise_findings(looks: Sequence[Look], parameters: Parameters) -> list[Finding]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Sequence
 from typing import Any
@@ -11,7 +12,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from eskf_ros.calibration.findings import Calibration, Finding
+from eskf_ros.calibration.findings import LEFT_TO_THE_NODE, Calibration, Finding
 from eskf_ros.parameters.docs import yaml_value
 from eskf_ros.parameters.mapping import leaves, to_mapping
 from eskf_ros.parameters.schema import Value
@@ -26,6 +27,7 @@ COMMENT_WIDTH = 112
 def parameter_file(calibration: Calibration) -> str:
     """Return a ROS parameter file: what was configured, and what was found, each with its sigma and evidence."""
     values, defaults = to_mapping(calibration.parameters), to_mapping(Parameters())
+    because = {name: f.name for f in calibration.findings if f.is_shown for name in LEFT_TO_THE_NODE.get(f.name, ())}
     by_parameter: dict[str, list[Finding]] = {}
     for finding in calibration.findings:
         by_parameter.setdefault(finding.parameter, []).append(finding)
@@ -38,12 +40,16 @@ def parameter_file(calibration: Calibration) -> str:
     for leaf in leaves():
         name = leaf.name
         found = by_parameter.get(name, [])
-        if name == "mode" or not (found or values[name] != defaults[name]):
+        # As text: a default that is not a number differs from itself.
+        is_default = yaml_value(values[name]) == yaml_value(defaults[name])
+        if name == "mode" or (is_default and not found):
             continue
         for finding in found:
             lines += _comment(finding)
-        if values[name] == () or (found and not any(f.is_shown for f in found) and values[name] == defaults[name]):
+        if values[name] == () or (is_default and not any(finding.is_shown for finding in found)):
             continue
+        if name in because:
+            lines.append(f"    # because {because[name]} was found")
         lines.append(f"    {name}: {yaml_value(rounded(values[name]))}")
     return "\n".join(lines) + "\n"
 
@@ -72,14 +78,28 @@ def as_dict(calibration: Calibration) -> dict[str, Any]:
 
 
 def show(calibration: Calibration, console: Console, is_compared: bool = True) -> None:
-    """Print the values, and the comparison of before and after recording by recording."""
-    table = Table("", "before", "found", "sigma", "unit", "", box=box.SIMPLE_HEAD, pad_edge=False)
+    """Print the values, why others stay open, and the comparison of before and after."""
+    table = Table("", box=box.SIMPLE_HEAD, pad_edge=False)
+    for heading in ("before", "found", "sigma"):
+        table.add_column(heading, justify="right")
+    table.add_column("unit")
     for finding in calibration.findings:
-        shown = (f"{finding.value:.5g}", f"{finding.std:.2g}") if finding.is_shown else ("-", "-")
-        table.add_row(finding.name, f"{finding.before:.5g}", *shown, finding.unit, finding.text)
+        shown = (_to_sigma(finding), f"{finding.std:.2g}") if finding.is_shown else ("-", "-")
+        table.add_row(finding.name, f"{finding.before:.5g}", *shown, finding.unit)
     console.print(table, highlight=False)
+    for finding in calibration.findings:
+        if not finding.is_shown:
+            console.print(f"{finding.name} {finding.text}", highlight=False)
     if calibration.figures and is_compared:
         console.print(comparison(calibration), highlight=False)
+
+
+def _to_sigma(finding: Finding) -> str:
+    """Return a value with two digits of its standard deviation, and at most five of its own."""
+    if not (finding.value and finding.std > 0.0):
+        return f"{finding.value:.5g}"
+    digits = math.floor(math.log10(abs(finding.value))) - math.floor(math.log10(finding.std)) + 2
+    return f"{finding.value:.{min(max(digits, 1), 5)}g}"
 
 
 def comparison(calibration: Calibration) -> Table:

@@ -168,9 +168,10 @@ def _gap_findings(sensor: Sensor, timing: Timing, shortest: float, is_imu: bool)
         return []
     gaps = timing.gaps[long]
     first = float((timing.gap_starts[long][0] - sensor.stamp[sensor.stamp > 0].min()) * 1e-9)
+    plural = "s" if len(gaps) > 1 else ""
     text = (
-        f"{len(gaps)} gaps of more than {shortest:g} s, {gaps.sum():.1f} s in all, the longest {gaps.max():.2f} s; "
-        f"the first at {first:.1f} s"
+        f"{len(gaps)} gap{plural} of more than {shortest:g} s, {gaps.sum():.1f} s in all, "
+        f"the longest {gaps.max():.2f} s; the first at {first:.1f} s"
     )
     evidence = {"gaps": len(gaps), "longest_s": float(gaps.max()), "total_s": float(gaps.sum())}
     if not is_imu:

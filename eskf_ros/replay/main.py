@@ -99,7 +99,7 @@ def _replay(bag: Path, folder: Path, parameters: Parameters, options: argparse.N
 
     wanted = _wanted(folder, options)
     try:
-        with _progress(bag, options.quiet) as progress:
+        with _progress(bag, options.quiet) as (progress, compiling):
             summary = replay(bag, parameters, wanted, progress, started)
     except (BagError, InputError) as error:
         raise Mistake(str(error)) from error
@@ -107,7 +107,7 @@ def _replay(bag: Path, folder: Path, parameters: Parameters, options: argparse.N
         raise Mistake(f"{error.filename or folder}: {error.strerror or error}") from error
     report = _report(folder) if options.report else None
     if not options.quiet:
-        _show(summary, folder, report, to_stderr=options.json == "-")
+        _show(summary, folder, report, compiling(), to_stderr=options.json == "-")
     for warning in summary["warnings"]:
         _say(f"warning: {warning}")
     return summary
@@ -157,16 +157,19 @@ def _replay_fleet(found: Sequence[Found], parameters: Parameters, options: argpa
 
 
 @contextmanager
-def _progress(bag: Path, quiet: bool) -> Iterator[Callable[[float], None]]:
-    """Show a progress bar if there is a terminal; report compiling in any case."""
+def _progress(bag: Path, quiet: bool) -> Iterator[tuple[Callable[[float], None], Callable[[], float]]]:
+    """Show a progress bar if there is a terminal; report compiling in any case.
+
+    Gives what is called with the share that is done, and what returns the seconds of compiling.
+    """
     if quiet:
-        yield lambda share: None
+        yield lambda share: None, lambda: 0.0
         return
     from eskf_ros.compiled import sentence_on_compiling, while_compiling
 
     if not sys.stderr.isatty():
-        with while_compiling(sentence_on_compiling(_say)):
-            yield lambda share: None
+        with while_compiling(sentence_on_compiling(_say)) as compiling:
+            yield lambda share: None, compiling
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -174,8 +177,8 @@ def _progress(bag: Path, quiet: bool) -> Iterator[Callable[[float], None]]:
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("starting", total=1.0)
-        with while_compiling(sentence_on_compiling(lambda text: bar.update(task, description=text))):
-            yield lambda share: bar.update(task, description=bag.name, completed=share)
+        with while_compiling(sentence_on_compiling(lambda text: bar.update(task, description=text))) as compiling:
+            yield lambda share: bar.update(task, description=bag.name, completed=share), compiling
 
 
 def _write_json(target: str, content: Any) -> None:
@@ -190,16 +193,18 @@ def _write_json(target: str, content: Any) -> None:
         raise Mistake(f"--json {target}: {error.strerror or error}") from error
 
 
-def _show(summary: dict[str, Any], folder: Path, report: Path | None, to_stderr: bool) -> None:
-    """Print the tables."""
+def _show(summary: dict[str, Any], folder: Path, report: Path | None, compiling: float, to_stderr: bool) -> None:
+    """Print the tables; ``compiling``: seconds of the replay that only the first one takes."""
     from rich.console import Console
 
     console = Console(stderr=to_stderr)
     duration, imu_count = summary["duration_s"], summary["imu_count"]
     rate = (imu_count - 1) / duration if duration > 0.0 else 0.0
+    seconds = summary["wall_s"] - compiling
+    after = f" after {compiling:.0f} s of compiling" if compiling >= 1.0 else ""
     console.print(
-        f"{summary['bag']}: {duration:.1f} s, IMU {rate:.1f} Hz, replayed in {summary['wall_s']:.2f} s "
-        f"({summary['realtime_factor']:.0f} times real time), at the end {summary['final']['status']}",
+        f"{summary['bag']}: {duration:.1f} s, IMU {rate:.1f} Hz, replayed in {seconds:.2f} s{after} "
+        f"({duration / seconds:.0f} times real time), at the end {summary['final']['status']}",
         highlight=False,
         soft_wrap=True,
     )

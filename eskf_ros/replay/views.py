@@ -45,6 +45,8 @@ REPORT_LAG = 70 * SECOND
 """ns; records of measurements are final by then: history.window is 60 s at most."""
 
 NODE = "/eskf_replay"
+COUNT_NAMES = tuple(f"{stream} {verdict.name.lower()}" for stream in STREAM_NAMES for verdict in Verdict)
+"""Names of the counts of verdicts, in the order of a table of streams and verdicts."""
 IMU_FRAME = "imu"
 """Frame of the biases; the recording may have none."""
 
@@ -103,36 +105,43 @@ class Views:
     def _report(self, until: int) -> None:
         """Write /diagnostics as the node has them, as far as a replay knows it, of the rows up to a stamp (ns)."""
         done = [row for row in self._unreported if row["stamp"] <= until]
+        if not done:
+            return
         self._unreported = self._unreported[len(done) :]
+        stamps = np.array([row["stamp"] for row in done], np.int64)
+        place = np.searchsorted(
+            np.maximum.accumulate(stamps), self._uncounted["stamp"]
+        )  # the first row that counts the record
+        counted = self._uncounted[place < len(done)]
+        new = np.zeros((len(done), *self._counts.shape), np.int64)
+        np.add.at(new, (place[place < len(done)], counted["stream"], counted["verdict"]), 1)
+        self._uncounted = self._uncounted[place == len(done)]
         messages = []
-        for row in done:
-            is_counted = self._uncounted["stamp"] <= row["stamp"]
-            counted, self._uncounted = self._uncounted[is_counted], self._uncounted[~is_counted]
-            np.add.at(self._counts, (counted["stream"], counted["verdict"]), 1)
-            counts = {
-                f"{STREAM_NAMES[stream]} {Verdict(verdict).name.lower()}": str(self._counts[stream, verdict])
-                for stream, verdict in np.argwhere(self._counts).tolist()
-            }
+        for row, stamp, more in zip(done, stamps.tolist(), new, strict=True):
+            self._counts += more
+            found = np.flatnonzero(self._counts)
+            names = [COUNT_NAMES[number] for number in found.tolist()]
+            counts = dict(zip(names, map(str, self._counts.ravel()[found].tolist()), strict=True))
             state, quality = State(int(row["status"])), words.quality(row, NODE)
             level = OK if state == State.GOOD and quality.level == OK else WARN
             message = "; ".join([state.name, *([] if quality.level == OK else [quality.message])])
             status = Status(level, f"{NODE}: navigation", message, {**words.figures(row), **counts})
-            messages.append(diagnostic_array(int(row["stamp"]), [status]))
-        self._bag.write(self._diagnostics, np.array([row["stamp"] for row in done], np.int64), messages)
+            messages.append(diagnostic_array(stamp, [status]))
+        self._bag.write(self._diagnostics, stamps, messages)
 
     def _write_verdicts(self, records: NDArray[Any]) -> None:
         self._uncounted = np.concatenate([self._uncounted, records])
+        records = records[~np.isin(records["stream"], words.SIGNALS)]
+        stamps = np.ascontiguousarray(records["stamp"])
+        kinds = zip(*(records[name].tolist() for name in ("stream", "source", "verdict")), strict=True)
+        is_good = np.isin(records["verdict"], words.GOOD_VERDICTS).tolist()
         chosen = []
-        for record in records[~np.isin(records["stream"], words.SIGNALS)]:
-            kind = int(record["stream"]), int(record["source"]), int(record["verdict"])
-            second = int(record["stamp"]) // SECOND
-            if record["verdict"] not in words.GOOD_VERDICTS or self._last_verdict.get(kind) != second:
+        for place, (kind, second) in enumerate(zip(kinds, (stamps // SECOND).tolist(), strict=True)):
+            if not is_good[place] or self._last_verdict.get(kind) != second:
                 self._last_verdict[kind] = second
-                chosen.append(record)
-        if chosen:
-            stamps = np.array([record["stamp"] for record in chosen], np.int64)
-            messages = [diagnostic_array(int(record["stamp"]), [words.verdict(record)]) for record in chosen]
-            self._bag.write(self._verdicts, stamps, messages)
+                chosen.append(place)
+        messages = [diagnostic_array(int(stamps[place]), [words.verdict(records[place])]) for place in chosen]
+        self._bag.write(self._verdicts, stamps[chosen], messages)
 
     def write_truth(self, epochs: NDArray[Any], map_frame: MapFrame | None) -> None:
         """Write truth epochs (n,) `EPOCH` in the map; without one they wait for it."""

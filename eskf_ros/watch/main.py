@@ -60,7 +60,7 @@ def _live(node: str, once: bool) -> int:
         from eskf_ros.ros_node.listen import listen
     except ImportError:
         print(
-            "eskf_watch: rclpy is not there: source a ROS 2 installation, pip install eskf_ros[ros], or give --bag",
+            "eskf_watch: error: rclpy is missing: source a ROS installation, pip install eskf_ros[ros], or give --bag",
             file=sys.stderr,
         )
         return 2

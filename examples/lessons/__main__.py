@@ -61,7 +61,7 @@ they mean. Text and figures are written by one command, in a few minutes:
 ```
 
 It needs matplotlib, which `./run test` installs (elsewhere: `pip install '.[lessons]'`). The code of a lesson is one
-file in [examples/lessons](../../examples/lessons), made to be changed; the section "By hand" of each page shows the
+file in `examples/lessons`, made to be changed; the section "By hand" of each page shows the
 same with the commands of this package. Figures hold for the seeds of the file; other seeds give others, about as large.
 
 | lesson | in one sentence |

@@ -34,8 +34,8 @@ nothing to see, and a parked robot is no test. Where the speed changes, the velo
 late velocity points to where the car was heading, and the filter turns its heading to fit.
 
 As with the lever arm the innovations of the fixes say little. What gives it away is that the residuals are
-proportional to speed and acceleration; the filter looks for this, and names the offset. It is too small where the
-states have taken over a part of it, so look at it once more after a correction, until nothing is said.
+proportional to speed and acceleration; the filter looks for this, and names the offset. It is a little too small where
+the states have taken over a part of it, so look at it once more after a correction, until nothing is said.
 
 ## What to take home
 

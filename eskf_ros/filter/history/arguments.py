@@ -33,7 +33,7 @@ def whole_stamps(stamps: StampArray) -> StampArray:
     found = np.asarray(stamps)
     if found.ndim != 1:
         raise ValueError(f"stamps have the shape {found.shape}; one row of n is needed: (n,)")
-    if len(found) and not np.issubdtype(found.dtype, np.integer):
+    if found.dtype != np.int64 and len(found) and not np.issubdtype(found.dtype, np.integer):
         raise TypeError(
             f"stamps are of type {found.dtype}: they must be int64 nanoseconds; for seconds: "
             "np.round(seconds * 1e9).astype(np.int64)"
