@@ -207,7 +207,7 @@ def _delay(state: np.void) -> tuple[float, float]:
     product, gained, off = (float(value) for value in state["motion"]["delay"])
     windows = float(state["motion"]["axes"][2])
     if windows < FEWEST_GAINS or gained < LEAST_GAIN * windows:
-        return 0.0, 0.0
+        return 0.0, math.inf if windows else 0.0
     left = max(0.0, off - product * product / gained)
     return -product / gained, math.sqrt(left / (2.0 * windows * gained))
 
