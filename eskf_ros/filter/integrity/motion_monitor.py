@@ -37,10 +37,8 @@ MOTION = np.dtype(
         ("start_stamp", "i8"),
         ("start_fix", "f8", (3,)),
         ("start_way", "f8", (2,)),
-        ("start_velocity", "f8", (2,)),
         ("axes", "f8", (3,)),
         ("has_other_axes", "i8"),
-        ("delay", "f8", (3,)),
         ("last_stamp", "i8"),
         ("last_velocity", "f8", (2,)),
         ("last_turned", "f8", (3,)),
@@ -65,12 +63,9 @@ MOTION = np.dtype(
 - ``fix_stamp``, ``fix``: the last fix (ns; m, Earth-centred). ``heard_stamp``: when the last velocity came (ns).
   ``velocity``, ``velocity_stamp``: that velocity (m/s), and up to when its integral ``way`` (m) since the last fix is.
 - ``jumps``, ``jump``: how often fixes jumped, and the furthest (m).
-- ``start_stamp``, ``start_fix``, ``start_velocity``, ``start_way``: a window of positions, the velocity at its begin,
-  and the integral of the velocities over it.
+- ``start_stamp``, ``start_fix``, ``start_way``: a window of positions, and the integral of the velocities over it.
 - ``axes``: sums of the squares (m2) by which velocities differ from the changes of positions, as they are and with east
   and north exchanged, and the number of windows. ``has_other_axes``: they are exchanged.
-- ``delay``: sums of the products of these differences with the change of velocity (m2/s), of the squares of that
-  (m2/s2), and of the squares of the differences (m2): positions that are late differ so.
 - ``last_*``: velocity at the end of the window before (positions alone: in its middle), and the integrals over it.
   Where velocities come, windows begin and end with them.
 - ``turns``, ``pushes``: the comparisons.
@@ -208,14 +203,12 @@ def watch_position(state, aid, settings):
             change = change_between(motion.start_fix, fix, axes)
             if has_velocity:
                 compare_axes(motion, change)
-                compare_times(motion, change)
             else:
                 close_window(motion, aid, change, passed, settings)
         elif not has_velocity:
             motion.last_stamp = NEVER
         motion.start_stamp = aid.stamp
         motion.start_way[0], motion.start_way[1] = 0.0, 0.0
-        motion.start_velocity[0], motion.start_velocity[1] = motion.velocity[0], motion.velocity[1]
         for i in range(3):
             motion.start_fix[i] = fix[i]
             if not has_velocity:
@@ -376,18 +369,3 @@ def compare_axes(motion, change):
     own, exchanged, ways = motion.axes[0], motion.axes[1], motion.axes[2]
     is_other = ways > FEWEST_WAYS and own > OTHER_WAY * ways and own > BETTER * exchanged
     motion.has_other_axes = 1 if is_other else 0
-
-
-@njit
-def compare_times(motion, change):
-    """Add what tells by how much positions are stamped later than velocities.
-
-    Positions that are late by d move by the integral of the velocities less d times the change of velocity.
-    """
-    for i in range(3):
-        motion.delay[i] *= 1.0 - 1.0 / MEMORY
-    for i in range(2):
-        off, gained = change[i] - motion.start_way[i], motion.velocity[i] - motion.start_velocity[i]
-        motion.delay[0] += off * gained
-        motion.delay[1] += gained * gained
-        motion.delay[2] += off * off

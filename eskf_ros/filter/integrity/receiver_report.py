@@ -13,6 +13,7 @@ from eskf_ros.filter.integrity.installation_monitor import (
     GYRO_SCALE,
     LASTING_LOOKS,
     POSITION_TIME,
+    TIME_ERROR,
     VELOCITY_TIME,
 )
 from eskf_ros.filter.integrity.motion_report import LONGEST_COMPARISON, has_compared
@@ -33,19 +34,12 @@ DOUBTFUL_SIGMAS = 15.0
 VERTICAL_SIGMAS = 30.0
 """The same for a vertical lever arm: it shows by roll and pitch alone, and many other errors go with those."""
 
-LEAST_DELAY, DELAY_SIGMAS, OPEN_SIGMAS = 0.05, 4.0, 2.5
-"""s and standard deviations by which positions must be later than the velocities of the same receiver to be told so,
-and from which on they may be: no other cause is told meanwhile."""
-
-FEWEST_GAINS, LEAST_GAIN = 40, 0.5
-"""Windows, and mean square (m2/s2) of the changes of velocity in them, from which on it is found: less is noise."""
-
-CERTAIN_DELAY_STD = 0.07
-"""s; standard deviation of that time above which it is waited for before fixes are blamed that move otherwise than the
-velocities, for `LONGEST_COMPARISON` at most."""
+OPEN_SIGMAS = 3.0
+"""Standard deviations of a time offset from which on it may be why: no other cause is told meanwhile."""
 
 CERTAIN_TIME_STD = 0.02
-"""s; standard deviation of the time offset of positions above which takeovers may come from one."""
+"""s; standard deviation of the time offset of positions above which takeovers may come from one, or fixes that move
+otherwise than velocities: for `LONGEST_COMPARISON` at most."""
 
 NOTABLE_CALM = 0.6
 """Share of the claims that must last for a note."""
@@ -70,22 +64,16 @@ def aid_complaints(state: np.void, settings: np.void, is_explained: bool, is_imu
     for source in range(SOURCES):
         if is_explained or state["receiver"]["fix_count"][source] < MANY_FIXES:
             continue
-        late, std = _delay(state) if source == 0 else (0.0, 0.0)
-        is_waiting = std > CERTAIN_DELAY_STD and int(state["stamp"]) - int(state["first_stamp"]) < LONGEST_COMPARISON
-        is_delayed = abs(late) > max(LEAST_DELAY, OPEN_SIGMAS * std)
         scale = float(settings["gnss_covariance_scale"])
-        lies = _covariance_complaints(state, source, scale, is_waiting or is_delayed)
+        lies = _covariance_complaints(state, source, scale, _may_be_late(state, source))
         # Fixes that scatter seem to jump.
         paths = [] if lies else _path_complaints(state, source)
         is_doubtful = is_imu_doubtful or bool(paths) or _departures(state, source) >= FEW_DEPARTURES
         faults = _fault_complaints(state, settings, source, is_doubtful)
-        # Velocities that are late by the IMU are the cause themselves.
-        if is_delayed and state["installation"]["held"][source, VELOCITY_TIME] < LASTING_LOOKS:
-            faults = _delay_complaints(settings, late, std)
         # Those faults explain drifts, contradictions and a high NIS: no sentences of their own.
         found += paths + faults + lies
         # One that is not certain for long may do so, too; or axes of the IMU, which take their time.
-        is_open = is_delayed or bool(state["installation"]["found"][source].any())
+        is_open = bool(state["installation"]["found"][source].any())
         if is_certain and not is_open and not paths and not faults and not lies:
             found += _velocity_complaints(state, source) + _departure_complaints(state, source)
     if state["recovery"]["resets"]:
@@ -202,25 +190,15 @@ def _velocity_complaints(state: np.void, source: int) -> list[str]:
     ]
 
 
-def _delay(state: np.void) -> tuple[float, float]:
-    """Return by how much (s) positions are stamped later than velocities, and its standard deviation; or zeros."""
-    product, gained, off = (float(value) for value in state["motion"]["delay"])
-    windows = float(state["motion"]["axes"][2])
-    if windows < FEWEST_GAINS or gained < LEAST_GAIN * windows:
-        return 0.0, math.inf if windows else 0.0
-    left = max(0.0, off - product * product / gained)
-    return -product / gained, math.sqrt(left / (2.0 * windows * gained))
-
-
-def _delay_complaints(settings: np.void, late: float, std: float) -> list[str]:
-    if abs(late) < max(LEAST_DELAY, DELAY_SIGMAS * std):
-        return []
-    right = float(settings["gnss_time_offset"][0]) - late
-    return [
-        f"the positions are stamped {abs(late):.2f} s (+- {std:.2f}) {'later' if late > 0.0 else 'earlier'} than the "
-        f"velocities of the same receiver: set gnss.time_offset to {right:.3f} and gnss.velocity_time_offset to "
-        f"{float(settings['velocity_time_offset']) + late:.3f}"
-    ]
+def _may_be_late(state: np.void, source: int) -> bool:
+    """Say whether positions are likely to be stamped late or early, or whether that is not known yet."""
+    installation = state["installation"]
+    late, std = (
+        float(installation["estimate"][source, POSITION_TIME]),
+        float(installation["sigma"][source, POSITION_TIME]),
+    )
+    is_early = int(state["stamp"]) - int(state["first_stamp"]) < LONGEST_COMPARISON
+    return abs(late) > max(TIME_ERROR, OPEN_SIGMAS * std) or (is_early and not 0.0 < std < CERTAIN_TIME_STD)
 
 
 def _path_complaints(state: np.void, source: int) -> list[str]:
