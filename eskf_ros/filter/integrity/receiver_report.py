@@ -34,6 +34,9 @@ DOUBTFUL_SIGMAS = 15.0
 VERTICAL_SIGMAS = 30.0
 """The same for a vertical lever arm: it shows by roll and pitch alone, and many other errors go with those."""
 
+SAME_TIME_SIGMAS = 2.0
+"""Standard deviations from which on positions are late, too, where velocities certainly are."""
+
 OPEN_SIGMAS = 3.0
 """Standard deviations of a time offset from which on it may be why: no other cause is told meanwhile."""
 
@@ -102,7 +105,12 @@ def _fault_complaints(state: np.void, settings: np.void, source: int, is_doubtfu
     clock = "ranges" if source == 0 and settings["solves_ranges"] else group
     texts = []
     at_position, at_velocity = float(found[POSITION_TIME]), float(found[VELOCITY_TIME])
-    both = at_position and at_velocity and abs(at_position - at_velocity) < 0.5 * abs(at_position)
+    likely = float(state["installation"]["estimate"][source, POSITION_TIME])
+    both = at_velocity and abs(likely) > SAME_TIME_SIGMAS * sigma[POSITION_TIME]
+    both = both and abs(likely - at_velocity) < 0.5 * abs(likely)
+    if both:
+        # Late positions seem to wander, and are less certain than late velocities.
+        at_position = likely
     if at_position:
         what = "fixes" if both or not at_velocity else "positions"
         right = float(settings["gnss_time_offset"][source]) + at_position
