@@ -21,11 +21,12 @@ from eskf_ros.filter.inertial.navigation_frame import FRAME
 from eskf_ros.filter.inertial.sample_quality import LEAST_FORCE_JUMP, LEAST_RATE_JUMP, SAMPLE_QUALITY
 from eskf_ros.filter.inertial.stamps import IMU_STAMPS
 from eskf_ros.filter.inertial.strapdown import IMU_READINGS
+from eskf_ros.filter.integrity.fault_effects import FAULTS
 from eskf_ros.filter.integrity.heading_corrections import CORRECTIONS
 from eskf_ros.filter.integrity.heading_monitor import HEADING_MONITOR
 from eskf_ros.filter.integrity.humble_lane import TRUST
 from eskf_ros.filter.integrity.imu_monitor import IMU_MONITOR
-from eskf_ros.filter.integrity.installation_monitor import FAULTS, INSTALLATION
+from eskf_ros.filter.integrity.installation_monitor import INSTALLATION
 from eskf_ros.filter.integrity.motion_monitor import MOTION
 from eskf_ros.filter.integrity.receiver_monitor import RECEIVER_MONITOR
 from eskf_ros.filter.integrity.recovery import RECOVERY

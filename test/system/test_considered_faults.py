@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from campaign.fault import DEFAULT_POSITION, DEFAULT_VELOCITY, TOLD_POSITION, TOLD_VELOCITY, Filter
 from campaign.judge import figures_of
 from campaign.running import recording_of, run_one
-from eskf_ros.filter.integrity.installation_monitor import FAULTS, GYRO_DRIFT, GYRO_SCALE, POSITION_TIME, VELOCITY_TIME
+from eskf_ros.filter.integrity.fault_effects import FAULTS, GYRO_DRIFT, GYRO_SCALE, POSITION_TIME, VELOCITY_TIME
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.scenario import Recording, simulate

@@ -13,7 +13,8 @@ from __future__ import annotations
 import math
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.integrity.installation_monitor import FAULTS, LEAST_INTERVAL
+from eskf_ros.filter.integrity.fault_effects import FAULTS
+from eskf_ros.filter.integrity.installation_monitor import LEAST_INTERVAL
 from eskf_ros.filter.integrity.scatter import FEWEST_PAIRS, LARGEST_SPREAD, NOTABLE_SCATTER
 from eskf_ros.filter.measurements.gnss_position import LEAST_WHITE, noise_shares
 from eskf_ros.filter.state.augmented_states import reset_augmented, update_error_size

@@ -7,15 +7,9 @@ import math
 import numpy as np
 from scipy.special import chdtri
 
+from eskf_ros.filter.integrity.fault_effects import GYRO_DRIFT, GYRO_SCALE, POSITION_TIME, VELOCITY_TIME
 from eskf_ros.filter.integrity.heading_monitor import given_heading_complaints
-from eskf_ros.filter.integrity.installation_monitor import (
-    GYRO_DRIFT,
-    GYRO_SCALE,
-    LASTING_LOOKS,
-    POSITION_TIME,
-    TIME_ERROR,
-    VELOCITY_TIME,
-)
+from eskf_ros.filter.integrity.installation_monitor import LASTING_LOOKS, TIME_ERROR
 from eskf_ros.filter.integrity.motion_report import LONGEST_COMPARISON, has_compared
 from eskf_ros.filter.integrity.receiver_monitor import (
     FEW_DEPARTURES,

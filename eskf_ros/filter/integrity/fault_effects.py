@@ -1,0 +1,165 @@
+"""Effects of constant faults of receivers and gyros on measurements, and on the estimate that has followed them.
+
+Lever arms, time offsets, and a scale error or a steady drift of the bias of the gyros. The antenna is R dl + v dt away
+from where the filter expects it. ``installation.absorbed`` is the derivative of the errors by the faults, carried
+through every prediction and update (Friedland, Treatment of bias in recursive filtering, 1969).
+"""
+
+from __future__ import annotations
+
+import math
+
+from eskf_ros.compiled import njit
+from eskf_ros.filter.inertial.sample_quality import shaken_density
+from eskf_ros.filter.inertial.strapdown import SMOOTHING_TIME, gravity_map
+from eskf_ros.filter.state.enums import Stream
+from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, SOURCES, VELOCITY
+from eskf_ros.filter.state.time import NEVER
+from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix
+
+FAULTS = 7
+"""Faults that are estimated for each receiver: three axes of the lever arm (m, body), the time offsets (s) of positions
+and of velocities, scale error of the gyros and drift of their bias (rad/s2): these are one, but each receiver sees
+them."""
+
+POSITION_TIME = 3
+"""Index of the time offset of positions among the faults."""
+
+VELOCITY_TIME = 4
+"""Index of the time offset of velocities among the faults."""
+
+GYRO_SCALE = 5
+"""Index of the scale error of the gyros, the same for the three, among the faults."""
+
+GYRO_DRIFT = 6
+"""Index of the steady drift of the bias of the gyros about the vertical among the faults."""
+
+CERTAIN_SHARE = 2.0
+"""Ratio of the square of an acceleration or a rate to its variance below which it says nothing of the faults."""
+
+
+@njit
+def write_effect(state, aid, work, settings):
+    """Write the derivative of a measurement by the faults of its receiver to ``work.effect`` (3, 7).
+
+    It is zero for all streams but GNSS position and velocity, and for the faults of the gyros, which act in time.
+    """
+    effect = work.effect
+    for i in range(3):
+        for k in range(FAULTS):
+            effect[i, k] = 0.0
+    if aid.stream == Stream.GNSS_POSITION:
+        write_effect_on_position(state, aid.source, effect, settings)
+    elif aid.stream == Stream.GNSS_VELOCITY:
+        write_effect_on_velocity(state, effect)
+
+
+@njit
+def write_effect_on_position(state, source, effect, settings):
+    """Write the derivative of a position by the faults of its receiver to the first rows of ``effect``."""
+    rotation = to_matrix(state.attitude)
+    turning = rotate(rotation, cross(smoothed_rate(state, rotation), settings.lever_arms_body[source]))
+    for i in range(3):
+        for k in range(3):
+            effect[i, k] = rotation[i][k]
+        effect[i, POSITION_TIME] = state.velocity_map[i] + turning[i]
+
+
+@njit
+def write_effect_on_velocity(state, effect):
+    """Write the derivative of a velocity by the faults of its receiver to the first rows of ``effect``.
+
+    An acceleration that is not larger than what tilt and bias leave unknown of it says nothing: it would be explained
+    by the same errors as the innovation. Neither does a rate that is not larger than its own noise and vibration.
+    """
+    rotation = to_matrix(state.attitude)
+    rate = smoothed_rate(state, rotation)
+    force, bias = state.imu.smooth_force, state.accel_bias
+    felt = rotate(rotation, (force[0] - bias[0], force[1] - bias[1], force[2] - bias[2]))
+    gravity = gravity_map(state, (state.position_map[0], state.position_map[1], state.position_map[2]))
+    acceleration = (felt[0] + gravity[0], felt[1] + gravity[1], felt[2] + gravity[2])
+    unknown = dot(gravity, gravity) * (
+        state.covariance[ATTITUDE, ATTITUDE] + state.covariance[ATTITUDE + 1, ATTITUDE + 1]
+    )
+    for i in range(3):
+        unknown += state.covariance[ACCEL_BIAS + i, ACCEL_BIAS + i]
+    share = certain_share(dot(acceleration, acceleration), unknown)
+    rate_noise = shaken_density(state.quality, 3, state.imu.interval) ** 2 / (2.0 * SMOOTHING_TIME)
+    turning = certain_share(dot(rate, rate), 3.0 * rate_noise)
+    x = rotate(rotation, cross(rate, (1.0, 0.0, 0.0)))
+    y = rotate(rotation, cross(rate, (0.0, 1.0, 0.0)))
+    z = rotate(rotation, cross(rate, (0.0, 0.0, 1.0)))
+    for i in range(3):
+        effect[i, 0], effect[i, 1], effect[i, 2] = turning * x[i], turning * y[i], turning * z[i]
+        effect[i, VELOCITY_TIME] = share * acceleration[i]
+
+
+@njit
+def certain_share(square, unknown):
+    """Return the share of a vector, given its square, that is not its own error of a variance ``unknown``."""
+    return square / (square + unknown) if square > CERTAIN_SHARE * unknown else 0.0
+
+
+@njit
+def smoothed_rate(state, rotation):
+    """Return the rate of the body relative to the Earth (rad/s, IMU axes), without vibration and single noise.
+
+    A rate that carries the noise of the very sample that predicts the measurement would explain its own innovation.
+    """
+    earth, rate, bias = rotate_back(rotation, state.frame.earth_rate_map), state.imu.smooth_rate, state.gyro_bias
+    return (rate[0] - bias[0] - earth[0], rate[1] - bias[1] - earth[1], rate[2] - bias[2] - earth[2])
+
+
+@njit
+def absorb_completely(state, settings):
+    """Begin to carry the effect of the faults: position and velocity have followed the receivers with all of it.
+
+    So it is at the start, and when the filter goes on from the humble lane, which follows the receivers.
+    """
+    for source in range(SOURCES):
+        absorbed = state.installation.absorbed[source]
+        absorbed.fill(0.0)
+        write_effect_on_position(state, source, absorbed[POSITION:VELOCITY], settings)
+        write_effect_on_velocity(state, absorbed[VELOCITY:ATTITUDE])
+
+
+@njit
+def carry_absorbed(state, settings):
+    """Carry the effect of the faults on the state to the present; return the time (s) since the last measurement.
+
+    One step of the trapezoidal rule: exact enough for a second of a car's motion, and the fault estimates tolerate
+    more.
+    """
+    rotation = to_matrix(state.attitude)
+    f, b = state.specific_force, state.accel_bias
+    force = rotate(rotation, (f[0] - b[0], f[1] - b[1], f[2] - b[2]))
+    dt = 0.0 if state.installation.stamp == NEVER else (state.stamp - state.installation.stamp) * 1e-9
+    last = state.installation.force
+    mean = (0.5 * (force[0] + last[0]), 0.5 * (force[1] + last[1]), 0.5 * (force[2] + last[2]))
+    rate = rotate(rotation, smoothed_rate(state, rotation))
+    for source in range(SOURCES):
+        a = state.installation.absorbed[source]
+        # What the gyros read too much turns the attitude too far; a bias that drifts leaves its estimate behind.
+        for i in range(3):
+            a[ATTITUDE + i, GYRO_SCALE] += dt * rate[i]
+            a[GYRO_BIAS + i, GYRO_DRIFT] -= dt * rotation[2][i]
+        for k in range(FAULTS):
+            turning = rotate(rotation, (a[GYRO_BIAS, k], a[GYRO_BIAS + 1, k], a[GYRO_BIAS + 2, k]))
+            pulling = rotate(rotation, (a[ACCEL_BIAS, k], a[ACCEL_BIAS + 1, k], a[ACCEL_BIAS + 2, k]))
+            tilt = (
+                a[ATTITUDE, k] - 0.5 * dt * turning[0],
+                a[ATTITUDE + 1, k] - 0.5 * dt * turning[1],
+                a[ATTITUDE + 2, k] - 0.5 * dt * turning[2],
+            )
+            pushing = cross(tilt, mean)
+            for i in range(3):
+                gain = dt * (pushing[i] - pulling[i])
+                a[POSITION + i, k] += dt * (a[VELOCITY + i, k] + 0.5 * gain)
+                a[VELOCITY + i, k] += gain
+                a[ATTITUDE + i, k] -= dt * turning[i]
+            for i in range(ERROR_SIZE, state.error_size):
+                a[i, k] *= math.exp(-settings.optional_decay[i - ERROR_SIZE] * dt)
+    state.installation.stamp = state.stamp
+    for i in range(3):
+        state.installation.force[i] = force[i]
+    return dt
