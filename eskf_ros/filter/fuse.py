@@ -33,6 +33,7 @@ from eskf_ros.filter.measurements import (
 )
 from eskf_ros.filter.measurements.kalman_update import update
 from eskf_ros.filter.measurements.row import NEEDS_FIELD, NEEDS_HEADING, NEEDS_POSITION
+from eskf_ros.filter.measurements.stamp_noise import note_cut_stamp
 from eskf_ros.filter.output.local_odometry import note_jump
 from eskf_ros.filter.state.augmented_states import update_error_size
 from eskf_ros.filter.state.enums import SENSOR_STREAMS, Stream, Verdict
@@ -64,6 +65,7 @@ def fuse(states, aids, i, settings, work):
     """Fuse or refuse one measurement; write the verdict to its record."""
     state = states[FILTER]
     if not open_record(aids, i):
+        note_cut_stamp(state, aids, i)
         return
     aid = aids[i]
     if is_repeated(state, aid):

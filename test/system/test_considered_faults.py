@@ -101,6 +101,7 @@ def test_the_estimate_follows_a_fault_as_the_monitor_says(fault: int) -> None:
         ("velocities stamped 0.13 s late", TOLD_VELOCITY),
         ("scale 1.5 %", TOLD_POSITION),
         ("clocks of IMU and receiver 1.2 s apart", TOLD_VELOCITY),
+        ("stamps cut to whole seconds", DEFAULT_VELOCITY),
     ],
 )
 def test_what_is_found_is_in_the_published_covariance(name: str, given: Filter) -> None:

@@ -96,6 +96,7 @@ def test_velocities_stamped_late_are_harmless_once_their_offset_is_given() -> No
         "clock set by +0.5 s for the rest",
         "clock set by +10 s for the rest",
         "clock set by -0.5 s for the rest",
+        "stamps cut to whole seconds",
         "positions stamped 0.25 s late",
         "heading given 120 deg wrong",
     ],

@@ -17,6 +17,7 @@ from eskf_ros.filter.integrity.receiver_monitor import (
     MANY_FIXES,
     UNLIKELY,
 )
+from eskf_ros.filter.measurements.stamp_noise import FEWEST_CUT
 from eskf_ros.filter.state.error_state import SOURCES
 
 SCATTERED_VELOCITY = 3.0
@@ -167,6 +168,8 @@ def aid_notes(state: np.void) -> list[str]:
     """Return one sentence for each receiver whose fixes err together for long: it is allowed for."""
     found = []
     for source in range(SOURCES):
+        if state["scatter"]["cut_stamps"][source] >= FEWEST_CUT:
+            continue
         change, pairs = float(state["scatter"]["change"][source]), float(state["scatter"]["pairs"][source])
         if pairs > 2 * MANY_FIXES and state["scatter"]["calm"][source] > NOTABLE_CALM:
             found.append(

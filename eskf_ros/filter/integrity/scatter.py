@@ -31,6 +31,7 @@ SCATTER = np.dtype(
         ("lasting", "f8", (SOURCES,)),
         ("calm", "f8", (SOURCES,)),
         ("walking", "f8", (SOURCES,)),
+        ("cut_stamps", "i8", (SOURCES,)),
         ("share", "f8", (SOURCES, 3)),
         ("claimed", "f8", (SOURCES, 3)),
         ("last_stamp", "i8", (SOURCES,)),
@@ -47,6 +48,7 @@ SCATTER = np.dtype(
   in the filter; ``walk_stamp``, ``walk_residual``, ``last_change``: of the last fix, as below, and its change (m, map).
 - ``white``, ``lasting``: shares of the claimed variance that are new with each fix, and that last and are estimated.
 - ``calm``: share that lasts and is followed by the position; ``walking``: share by which it grows from fix to fix.
+- ``cut_stamps``: other messages with the stamp of an earlier one, a whole second: see `measurements.stamp_noise`.
 - ``share``, ``claimed``: share of the position that comes from the fixes, and the variance they claim (m2), by axis of
   map.
 - ``last_stamp``, ``last_residual``: of the last fix: its stamp (ns), and how far it was from the position of the humble
@@ -90,6 +92,7 @@ def copy_scatter(state, lane, source):
     lane.scatter.white[source] = state.scatter.white[source]
     lane.scatter.lasting[source] = state.scatter.lasting[source]
     lane.scatter.velocity[source] = state.scatter.velocity[source]
+    lane.scatter.cut_stamps[source] = state.scatter.cut_stamps[source]
 
 
 @njit

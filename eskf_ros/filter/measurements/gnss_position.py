@@ -29,6 +29,7 @@ from eskf_ros.filter.measurements.jacobians import (
     set_minus_cross,
 )
 from eskf_ros.filter.measurements.row import NEEDS_LEVEL, OptionalBlock, Row, threefold
+from eskf_ros.filter.measurements.stamp_noise import add_way_of_cut_stamp
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, POSITION
 from eskf_ros.geodesy.earth import east_north_up_to_ecef, ecef_to_geodetic, geodetic_to_ecef
@@ -112,6 +113,7 @@ def linearize(state, payload, source, settings, work):
     set_east_north_up_covariance(work.noise, state, east_north_up_to_ecef(payload[0], payload[1]), payload, 3)
     linearize_antenna(state, position_of_fix(state, payload), source, settings, work)
     split_noise(state, source, settings, work)
+    add_way_of_cut_stamp(state, source, work)
     if state.heading_known == 0:
         add_unknown_lever(state, source, settings, work)
     return SIZE

@@ -31,6 +31,7 @@ from eskf_ros.filter.measurements.row import (
     linear_covariances,
     threefold,
 )
+from eskf_ros.filter.measurements.stamp_noise import add_gain_of_cut_stamp
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ATTITUDE, GYRO_BIAS, VELOCITY
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix
@@ -66,6 +67,7 @@ def linearize(state, payload, source, settings, work):
     for i in range(SIZE):
         for j in range(SIZE):
             work.noise[i, j] *= factor
+    add_gain_of_cut_stamp(state, source, work)
     linearize_antenna(state, measured, source, settings, work)
     return SIZE
 
