@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from eskf_ros.filter.history.records import RECORD
+from eskf_ros.filter.integrity.motion_monitor import offset_by_jumps
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import STREAM_NAMES, Verdict
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, VELOCITY
@@ -194,6 +195,8 @@ def published_covariance(states: np.void | NDArray[Any]) -> Array:
     found = states["installation"]
     effects = found["considered"] * found["is_considered"][..., None]
     covariance[..., :ERROR_SIZE, :ERROR_SIZE] += np.einsum("...si,...sj->...ij", effects, effects)
+    offsets = np.array([offset_by_jumps(state) for state in np.atleast_1d(states)]).reshape(*np.shape(states), 2)
+    covariance[..., :2, :2] += offsets[..., :, None] * offsets[..., None, :]
     late = states["motion"]["turns"]["lag"][..., None] * states["velocity_map"]
     covariance[..., :3, :3] += late[..., :, None] * late[..., None, :]
     return covariance

@@ -176,6 +176,23 @@ def test_clocks_that_are_apart_leave_the_way_of_that_time_unknown(seed: int) -> 
 
 
 @seeds
+def test_fixes_that_have_jumped_and_are_believed_may_be_off_by_the_jump(seed: int) -> None:
+    """It fades with time, and nothing is added while they are refused."""
+    state = running(seed)
+    before = published(state, MOUNTED)["pose_covariance"]
+    motion = state["motion"]
+    motion["jumps"], motion["offset"], motion["offset_stamp"] = 1, (12.0, -9.0), state["stamp"]
+    added = published(state, MOUNTED)["pose_covariance"] - before
+    np.testing.assert_allclose(added[:2, :2], np.outer((12.0, -9.0), (12.0, -9.0)), rtol=1e-9, atol=1e-9)
+    assert not added[2:].any()
+    motion["offset_stamp"] = state["stamp"] - round(60e9)
+    later = published(state, MOUNTED)["pose_covariance"] - before
+    np.testing.assert_allclose(later, added * np.exp(-2.0), rtol=1e-9, atol=1e-9)
+    state["trust"]["refused"][0, 0] = 1
+    np.testing.assert_array_equal(published(state, MOUNTED)["pose_covariance"], before)
+
+
+@seeds
 def test_biases_are_in_imu_axes(seed: int) -> None:
     state = running(seed)
     row = published(state, MOUNTED)

@@ -34,6 +34,8 @@ MOTION = np.dtype(
         ("way", "f8", (2,)),
         ("jumps", "i8"),
         ("jump", "f8"),
+        ("offset", "f8", (2,)),
+        ("offset_stamp", "i8"),
         ("start_stamp", "i8"),
         ("start_fix", "f8", (3,)),
         ("start_way", "f8", (2,)),
@@ -62,7 +64,8 @@ MOTION = np.dtype(
   ``longest_interval``: between two samples since the last fix (s).
 - ``fix_stamp``, ``fix``: the last fix (ns; m, Earth-centred). ``heard_stamp``: when the last velocity came (ns).
   ``velocity``, ``velocity_stamp``: that velocity (m/s), and up to when its integral ``way`` (m) since the last fix is.
-- ``jumps``, ``jump``: how often fixes jumped, and the furthest (m).
+- ``jumps``, ``jump``: how often fixes jumped, and the furthest (m). ``offset``, ``offset_stamp``: the sum of the jumps
+  (m), which fades with `OFFSET_TIME`, up to the last of them (ns): fixes that have jumped back are where they were.
 - ``start_stamp``, ``start_fix``, ``start_way``: a window of positions, and the integral of the velocities over it.
 - ``axes``: sums of the squares (m2) by which velocities differ from the changes of positions, as they are and with east
   and north exchanged, and the number of windows. ``has_other_axes``: they are exchanged.
@@ -91,6 +94,9 @@ JUMP_SIGMAS = 5.5
 
 LEAST_JUMP = 3.0
 """m; smaller steps of fixes are no jumps."""
+
+OFFSET_TIME = 60.0
+"""s; time in which it is forgotten that fixes have jumped. Reflections last for as long."""
 
 STRONGEST = 6.0
 """m/s2; acceleration that positions alone cannot tell from a jump."""
@@ -258,7 +264,26 @@ def watch_step(motion, aid, fix, axes, has_velocity):
     if passed < LONGEST_WINDOW and off > max(LEAST_JUMP + slack, JUMP_SIGMAS * math.sqrt(variance)):
         motion.jumps += 1
         motion.jump = max(motion.jump, off)
+        fades = math.exp(-(aid.stamp - motion.offset_stamp) * 1e-9 / OFFSET_TIME) if motion.jumps > 1 else 0.0
+        motion.offset[0] = fades * motion.offset[0] + change[0] - way[0]
+        motion.offset[1] = fades * motion.offset[1] + change[1] - way[1]
+        motion.offset_stamp = aid.stamp
         forget_window(motion)
+
+
+@njit
+def offset_by_jumps(state):
+    """Return by how much (m; east, north) the fixes may be off since they jumped, while they are believed.
+
+    The jump may have been one to the truth; that is not known, and fades.
+    """
+    motion = state.motion
+    passed = (state.stamp - motion.offset_stamp) * 1e-9
+    if motion.jumps == 0 or state.trust.refused[0, 0] > 0 or passed > 4.0 * OFFSET_TIME:
+        return 0.0, 0.0
+    fades = math.exp(-passed / OFFSET_TIME)
+    east, north = fades * motion.offset[0], fades * motion.offset[1]
+    return (east, north) if math.hypot(east, north) > LEAST_JUMP else (0.0, 0.0)
 
 
 @njit

@@ -10,6 +10,7 @@ from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.levelling import UNKNOWN_SPEED
 from eskf_ros.filter.inertial.navigation_frame import body_rate, heading_of
 from eskf_ros.filter.integrity.fix_errors import held_variance
+from eskf_ros.filter.integrity.motion_monitor import offset_by_jumps
 from eskf_ros.filter.output.status import quality_of, status_of
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, GYRO_BIAS, POSITION, SOURCES, VELOCITY
 from eskf_ros.geodesy.rotation import cross, from_matrix, from_rotation_vector, multiply, rotate, rotate_back, to_matrix
@@ -108,6 +109,10 @@ def write_odometry(state, local, settings, row):
     for source in range(SOURCES):
         if state.installation.is_considered[source] == 1:
             add_considered_faults(state, source, imu_offset, base_to_map, row)
+    offset = offset_by_jumps(state)
+    for i in range(2):
+        for j in range(2):
+            row.pose_covariance[i, j] += offset[i] * offset[j]
     lag = state.motion.turns.lag
     if lag != 0.0:
         for i in range(3):

@@ -12,6 +12,7 @@ import math
 from eskf_ros.compiled import njit
 from eskf_ros.filter.integrity.fix_errors import held_variance
 from eskf_ros.filter.integrity.heading_monitor import has_lasting_difference
+from eskf_ros.filter.integrity.motion_monitor import offset_by_jumps
 from eskf_ros.filter.state.enums import Quality, Status
 from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, POSITION, SOURCES
 from eskf_ros.filter.state.time import NEVER
@@ -82,7 +83,9 @@ def quality_of(state, status, settings):
     if status == Status.COASTING and state.stamp - state.recovery.absolute_stamp > coast_time:
         return Quality.COASTED_TOO_LONG
     variance = 0.0
+    offset = offset_by_jumps(state)
     for i in range(2):
+        variance += offset[i] ** 2
         variance += state.covariance[POSITION + i, POSITION + i] + held_variance(state, i)
         variance += (state.motion.turns.lag * state.velocity_map[i]) ** 2
         for source in range(SOURCES):
