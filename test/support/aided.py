@@ -51,12 +51,12 @@ class AidedNavigator(Navigator):
         self.offers = offers(recording)
         self.offered = 0
 
-    def push_imu(self, stamps: Any, specific_force: Any, angular_rate: Any) -> NDArray[Any]:
+    def push_imu(self, stamps: Any, specific_force: Any, angular_rate: Any, arrivals: Any = None) -> NDArray[Any]:
         while self.offered < len(self.offers) and self.offers[self.offered][0] <= stamps[-1]:
             stamp, stream, values, covariance, arrival = self.offers[self.offered]
             self.push(stream, stamp, values, covariance, arrival)
             self.offered += 1
-        return super().push_imu(stamps, specific_force, angular_rate)
+        return super().push_imu(stamps, specific_force, angular_rate, arrivals)
 
 
 def run_aided(recording: Recording, interval: float = 0.5, **changes: Any) -> Run:
