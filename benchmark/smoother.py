@@ -117,8 +117,8 @@ def run(recording: Recording, changes: dict[str, Any]) -> tuple[NDArray[Any], ND
         collected = []
         push = navigator.push_imu
 
-        def keep(*samples: Any, push: Any = push, collected: list[Any] = collected) -> Any:
-            collected.append(push(*samples))
+        def keep(*samples: Any, arrivals: Any, push: Any = push, collected: list[Any] = collected) -> Any:
+            collected.append(push(*samples, arrivals=arrivals))
             return collected[-1]
 
         navigator.push_imu = keep  # type: ignore[method-assign]
