@@ -29,6 +29,9 @@ noise grows with the ratio.
 WANDER_ACCELERATION = 0.5
 """m/s2; acceleration of the robot beyond the measured one that is assumed with an unknown heading (process noise)."""
 
+LARGEST_SHAKEN_DENSITY = 0.1
+"""m/s2/rtHz; vibration counts as noise of an acceleration up to here, lest the strongest hide all accelerations."""
+
 WANDER_TIME = 1.0
 """s; correlation time of the unknown acceleration with an unknown heading."""
 
@@ -55,7 +58,8 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
         predict_search(state, acceleration, middle, dt, settings)
         velocity_noise += WANDER_TIME * (WANDER_ACCELERATION**2 + dot(acceleration, acceleration))
     size, covariance = state.error_size, state.covariance
-    density = max(settings.accel_noise_density, shaken_density(state.quality, 0, state.imu.interval))
+    shaken = min(shaken_density(state.quality, 0, state.imu.interval), LARGEST_SHAKEN_DENSITY)
+    density = max(settings.accel_noise_density, shaken)
     force = credible_force(state.excitation, covariance, middle, force, gravity, dt, density)
     augmented_states.propagate_scale(state, middle, force_1, rate_1, dt, coupling, settings)
     propagate_covariance(covariance, size, middle, force, gravity, state.frame.earth_rate_map, dt, coupling, work)
