@@ -19,10 +19,14 @@ from eskf_ros.filter.integrity.fault_effects import (
     carry_absorbed,
     write_effect,
 )
+from eskf_ros.filter.integrity.heading_corrections import HEADING
 from eskf_ros.filter.measurements.kalman_update import invert_positive
 from eskf_ros.filter.state.enums import Stream, Verdict
 from eskf_ros.filter.state.error_state import ERROR_CAPACITY, ERROR_SIZE, SOURCES
 from eskf_ros.filter.state.time import NEVER, SECOND
+
+LEARNING_HEADING_STD = 0.35
+"""rad; where the heading is known no better, nothing is learnt of the faults."""
 
 LASTING_TIME = 60.0
 """s; correlation time of the errors of fixes that last, as far as the faults are concerned."""
@@ -112,6 +116,11 @@ def learn_faults(state, aid, size, gate, work, settings):
             # A wrong lever arm or time offset may be why the filter seemed wrong: the evidence stays.
             return
         forget_faults(state)
+        return
+    if state.covariance[HEADING, HEADING] > LEARNING_HEADING_STD**2:
+        # Far from the truth the derivatives are others.
+        state.installation.stamp = NEVER
+        state.installation.is_considered.fill(0)
         return
     if state.installation.stamp == NEVER:
         absorb_completely(state, settings)

@@ -29,6 +29,9 @@ DOUBTFUL_SIGMAS = 15.0
 VERTICAL_SIGMAS = 30.0
 """The same for a vertical lever arm: it shows by roll and pitch alone, and many other errors go with those."""
 
+LARGEST_TIME_STD = 0.05
+"""s; a time offset that is less certain is not told: at one speed it is an offset of the position, which may last."""
+
 SAME_TIME_SIGMAS = 2.0
 """Standard deviations from which on positions are late, too, where velocities certainly are."""
 
@@ -94,6 +97,9 @@ def _fault_complaints(state: np.void, settings: np.void, source: int, is_doubtfu
     vertical = int(np.argmax(np.abs(settings["imu_to_base"][2])))
     if abs(found[vertical]) < VERTICAL_SIGMAS * sigma[vertical]:
         found[vertical] = 0.0
+    for time in (POSITION_TIME, VELOCITY_TIME):
+        if sigma[time] > LARGEST_TIME_STD:
+            found[time] = 0.0
     if is_doubtful:
         found[np.abs(found) < DOUBTFUL_SIGMAS * sigma] = 0.0
     group = "gnss" if source == 0 else "second_gnss"
