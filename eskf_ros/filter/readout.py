@@ -217,8 +217,8 @@ class Readout:
         """One sentence for each fact worth knowing of the streams though nothing is wrong."""
         state, settings = self._states[0], self._settings[0]
         travel, is_fault = travel_complaints(state, settings, self.parameters.imu.mount_rpy_deg)
-        # Without altitudes fixes change by less than their three axes claim.
-        of_errors = [] if self._traffic.without_altitude else aid_notes(state)
+        # Without altitudes fixes change by less than their three axes claim; with wrong axes the path is wrong.
+        of_errors = [] if self._traffic.without_altitude or motion_complaints(state) else aid_notes(state)
         return self._traffic.notes() + of_errors + ([] if is_fault else travel)
 
     @property
