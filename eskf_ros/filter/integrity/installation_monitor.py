@@ -46,7 +46,7 @@ FAULT_PRIOR = (5.0, 5.0, 5.0, 1.0, 1.0, 0.03, 1e-4)
 FAULT_SIGMAS = 6.0
 """Standard deviations from zero beyond which a fault is reported."""
 
-CONSIDERED_SIGMAS = 4.0
+CONSIDERED_SIGMAS = 3.0
 """Standard deviations from zero beyond which what faults do to an error is allowed for: to be wrong costs certainty
 only."""
 
