@@ -112,6 +112,24 @@ def test_what_is_found_is_in_the_published_covariance(name: str, given: Filter) 
     assert figures.heading_lies <= 0.01
 
 
+@pytest.mark.parametrize(
+    ("name", "given", "worst"),
+    [
+        ("one gyro stuck for 40 s", TOLD_POSITION, 10.0),
+        ("velocity in north, east, down", TOLD_VELOCITY, 300.0),
+        ("train, rough line", DEFAULT_VELOCITY, 3.0),
+        ("RTK claims 1 cm and wanders 0.3 m", TOLD_POSITION, 2.0),
+    ],
+)
+def test_what_once_lost_the_filter_does_not(name: str, given: Filter, worst: float) -> None:
+    """Largest error (m), and neither position nor heading beyond 5 standard deviations once the fault has lasted."""
+    fault = BY_NAME[name]
+    figures = figures_of(fault, run_one(fault, recording_of(fault, 2), given))
+    assert figures.worst < worst
+    assert figures.position_lies <= 0.01
+    assert figures.heading_lies <= 0.01
+
+
 def test_a_clean_drive_considers_nothing() -> None:
     navigator = Navigator(from_mapping(drive().parameters()))
     for _, state in feed(drive(), navigator, np.arange(100, len(drive().imu_stamp), 100)):

@@ -157,8 +157,10 @@ def carry_absorbed(state, settings):
                 a[POSITION + i, k] += dt * (a[VELOCITY + i, k] + 0.5 * gain)
                 a[VELOCITY + i, k] += gain
                 a[ATTITUDE + i, k] -= dt * turning[i]
-            for i in range(ERROR_SIZE, state.error_size):
-                a[i, k] *= math.exp(-settings.optional_decay[i - ERROR_SIZE] * dt)
+        for i in range(ERROR_SIZE, state.error_size):
+            remaining = math.exp(-settings.optional_decay[i - ERROR_SIZE] * dt)
+            for k in range(FAULTS):
+                a[i, k] *= remaining
     state.installation.stamp = state.stamp
     for i in range(3):
         state.installation.force[i] = force[i]
