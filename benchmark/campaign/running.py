@@ -151,22 +151,31 @@ def run_one(
     taken = (recording.imu_taken - start) * 1e-9
     stops = np.unique(np.searchsorted(taken, np.arange(1.0, taken[-1])))
     states: list[np.ndarray] = []
-    records = []
+    parts = []
     said: dict[str, float] = {}
     for k, state in enumerate(states_at(stops, recording, navigator, messages, has_order_of_arrival(fault))):
         if states or state["position_known"]:
             states.append(state.copy())
         if k % ASKED_EVERY == 0:
-            records.append(navigator.take_records())
+            parts.append(navigator.take_records())
             for sentence in sentences(navigator):
                 said.setdefault(sentence, float(taken[stops[k]]))
-    records.append(navigator.finish())
+    parts.append(navigator.finish())
     final = () if any(sentence.startswith(RAISED) for sentence in sentences(navigator)) else tuple(navigator.complaints)
     for sentence in sentences(navigator):
         said.setdefault(sentence, float(taken[-1]))
     if not states:  # The filter never started: it claims nothing, and has nothing but its word.
         states.append(state.copy())
-    return _trace(recording, navigator, stops, np.array(states), np.concatenate(records, dtype=RECORD), said, final)
+    records = np.concatenate(parts, dtype=RECORD)
+    return _trace(recording, navigator, stops, _together(states), records, said, final)
+
+
+def _together(states: Sequence[np.ndarray]) -> np.ndarray:
+    """Return one array of states; `numpy.array` would compare their hundreds of fields one with the other."""
+    found = np.empty(len(states), states[0].dtype)
+    for k, state in enumerate(states):
+        found[k] = state
+    return found
 
 
 def has_order_of_arrival(fault: Fault) -> bool:
