@@ -84,6 +84,7 @@ STATE = np.dtype(
         ("restarts", "i8"),
         # How much the IMU noise is widened, from 0 (as the parameters say) to 1 (as for the humble lane).
         ("doubt", "f8"),
+        ("bias_doubt", "f8"),
         # The records of the rooms.
         ("imu", IMU_READINGS),
         ("excitation", EXCITATION),

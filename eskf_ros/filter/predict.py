@@ -50,7 +50,7 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
     rate_1 = augmented_states.unscaled(state, rate_1, state.gyro_bias, 3, settings)
     middle, force, gravity = propagate_nominal_state(state, force_0, rate_0, force_1, rate_1, dt, coupling)
     # Motion hidden by a gap is assumed to be constant; this density gives the same variance at its end.
-    accel_noise, gyro_noise, accel_walk, gyro_walk = imu_noise(state.doubt, settings)
+    accel_noise, gyro_noise, accel_walk, gyro_walk = imu_noise(state.doubt, state.bias_doubt, settings)
     velocity_noise = accel_noise + settings.gap_accel_std**2 * gap
     attitude_noise = gyro_noise + settings.gap_gyro_std**2 * gap
     if state.heading_known == 0:
@@ -77,33 +77,28 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
 
 
 @njit
-def imu_noise(doubt, settings):
+def imu_noise(doubt, bias_doubt, settings):
     """Return the spectral densities of accelerometer and gyro, and of the random walks of their biases.
 
-    They are those of the parameters for the ``doubt`` 0, those of the humble lane for 1, and geometric means between.
+    They are those of the parameters for the doubt 0 (of white noise, of the biases), those of the humble lane for 1,
+    and geometric means between.
     """
-    told = (
-        settings.accel_noise_density**2,
-        settings.gyro_noise_density**2,
-        settings.accel_bias_random_walk**2,
-        settings.gyro_bias_random_walk**2,
-    )
     humble = settings.humble_noise
-    if doubt == 0.0:
-        return told
-    if doubt == 1.0:
-        return humble[0], humble[1], humble[2], humble[3]
     return (
-        between_noise(told[0], humble[0], doubt),
-        between_noise(told[1], humble[1], doubt),
-        between_noise(told[2], humble[2], doubt),
-        between_noise(told[3], humble[3], doubt),
+        between_noise(settings.accel_noise_density**2, humble[0], doubt),
+        between_noise(settings.gyro_noise_density**2, humble[1], doubt),
+        between_noise(settings.accel_bias_random_walk**2, humble[2], bias_doubt),
+        between_noise(settings.gyro_bias_random_walk**2, humble[3], bias_doubt),
     )
 
 
 @njit
 def between_noise(told, humble, doubt):
     """Return the geometric mean of two densities with the weights 1 - ``doubt`` and ``doubt``."""
+    if doubt == 0.0:
+        return told
+    if doubt == 1.0:
+        return humble
     return told ** (1.0 - doubt) * humble**doubt
 
 

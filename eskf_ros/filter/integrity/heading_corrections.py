@@ -57,4 +57,10 @@ def weigh_correction(state, before, correction):
         c.variance = 0.0
     c.total += correction
     c.variance += max(before - state.covariance[HEADING, HEADING], 0.0)
-    return max(c.left, c.right) > LIMIT
+    return one_way(state) > LIMIT
+
+
+@njit
+def one_way(state):
+    """Return how far the corrections go one way (standard deviations, the allowance taken off)."""
+    return max(state.corrections.left, state.corrections.right)

@@ -23,6 +23,7 @@ import numpy as np
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import heading_of
+from eskf_ros.filter.integrity.heading_corrections import one_way
 from eskf_ros.filter.integrity.refusal import (
     IMU_ASTRAY,
     JUMP_GATE,
@@ -36,10 +37,10 @@ from eskf_ros.filter.integrity.refusal import (
 )
 from eskf_ros.filter.measurements import gnss_position, gnss_velocity
 from eskf_ros.filter.measurements.jacobians import clear
-from eskf_ros.filter.measurements.kalman_update import apply, judge
+from eskf_ros.filter.measurements.kalman_update import apply, judge, update
 from eskf_ros.filter.state.augmented_states import reset_augmented
-from eskf_ros.filter.state.enums import Stream
-from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, SOURCES, VELOCITY
+from eskf_ros.filter.state.enums import Stream, Verdict
+from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, SOURCES, VELOCITY
 from eskf_ros.filter.state.lanes import FILTER, HUMBLE, LANES, is_running
 from eskf_ros.filter.state.streams import is_live
 from eskf_ros.filter.state.time import NEVER
@@ -96,6 +97,12 @@ together, which least squares over one epoch do not know.
 LOST_HEADING_STD = 0.5
 """rad; a humble lane that knows the heading no better starts anew from the filter."""
 
+BIAS_GATE = 11.34
+"""NIS of three biases of the filter in the humble lane beyond which they are wrong: the chi-square quantile of 0.99."""
+
+DRIFT = 1.5
+"""Standard deviations (`heading_corrections.one_way`) of the heading from which on the biases are doubted."""
+
 OPENED_TILT_STD = 0.1
 """rad per axis; of roll and pitch after a fault of the IMU."""
 
@@ -119,6 +126,7 @@ def start(states, settings):
     states[HUMBLE] = states[FILTER]
     humble.error_size = size_for_gnss(state, settings)
     humble.doubt = 1.0
+    humble.bias_doubt = 1.0
     state.trust.evidence = 0.0
 
 
@@ -291,17 +299,28 @@ def is_heading_apart(states, settings):
 
 @njit
 def update_doubt(state):
-    """Let the doubt about the IMU fade from 1 to 0 over ``doubt_time`` after a takeover."""
+    """Let the doubts about the IMU fade from 1 to 0 over ``doubt_time`` after a takeover."""
     if state.doubt == 0.0:
         return
     passed = (state.stamp - state.trust.doubt_stamp) * 1e-9
-    state.doubt = max(0.0, 1.0 - passed / state.trust.doubt_time)
+    fades = max(0.0, 1.0 - passed / state.trust.doubt_time)
+    state.bias_doubt = min(state.bias_doubt, fades)
+    state.doubt = fades
 
 
 @njit
-def reset_to_humble_lane(states):
-    """Continue the filter from the humble lane, with wide IMU noise that narrows again."""
+def reset_to_humble_lane(states, is_bias_wrong, work):
+    """Continue the filter from the humble lane, with wide IMU noise that narrows again.
+
+    Unless ``is_bias_wrong``, or this is the second time in a row, the filter keeps the biases that the humble lane does
+    not contradict: reflections near a receiver look like an IMU that goes astray, and the biases of the humble lane,
+    which follow the last seconds, would be the worse ones to coast on.
+    """
     state, humble = states[FILTER], states[HUMBLE]
+    accel, gyro = state.accel_bias, state.gyro_bias
+    accel_bias, gyro_bias = (accel[0], accel[1], accel[2]), (gyro[0], gyro[1], gyro[2])
+    accel_variance = variances(state.covariance, ACCEL_BIAS)
+    gyro_variance = variances(state.covariance, GYRO_BIAS)
     for i in range(3):
         state.position_map[i] = humble.position_map[i]
         state.velocity_map[i] = humble.velocity_map[i]
@@ -320,11 +339,36 @@ def reset_to_humble_lane(states):
             state.covariance[j, i] = 0.0
     trust = state.trust
     passed = (state.stamp - trust.doubt_stamp) * 1e-9 if trust.doubt_stamp != NEVER else math.inf
-    if passed < 3.0 * trust.doubt_time:
-        trust.doubt_time = min(2.0 * trust.doubt_time, LONGEST_DOUBT)
-    else:
+    is_first = passed >= FIRST_DOUBT
+    if passed >= 3.0 * trust.doubt_time:
         trust.doubt_time = FIRST_DOUBT
+    else:
+        trust.doubt_time = min(2.0 * trust.doubt_time, LONGEST_DOUBT)
     trust.doubt_stamp = state.stamp
     trust.evidence = 0.0
     trust.takeovers += 1
     state.doubt = 1.0
+    state.bias_doubt = 1.0
+    if is_first and not is_bias_wrong and one_way(state) < DRIFT:
+        keeps_accel = keep_bias(state, ACCEL_BIAS, accel_bias, accel_variance, work)
+        keeps_gyro = keep_bias(state, GYRO_BIAS, gyro_bias, gyro_variance, work)
+        state.bias_doubt = 0.0 if keeps_accel and keeps_gyro else 1.0
+
+
+@njit
+def variances(covariance, first):
+    """Return the three variances from index ``first`` on."""
+    return covariance[first, first], covariance[first + 1, first + 1], covariance[first + 2, first + 2]
+
+
+@njit
+def keep_bias(state, first, bias, variance, work):
+    """Fuse three biases from index ``first`` on that were known before; return False where they are contradicted."""
+    clear(work)
+    for i in range(3):
+        now = state.accel_bias[i] if first == ACCEL_BIAS else state.gyro_bias[i]
+        work.innovation[i] = bias[i] - now
+        work.jacobian[i, first + i] = 1.0
+        work.noise[i, i] = variance[i]
+    verdict, _ = update(state, 3, BIAS_GATE, work)
+    return verdict == Verdict.FUSED

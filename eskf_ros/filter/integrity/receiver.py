@@ -32,7 +32,14 @@ from eskf_ros.filter.integrity.humble_lane import (
     weigh_evidence,
 )
 from eskf_ros.filter.integrity.recovery import note, note_reset
-from eskf_ros.filter.integrity.refusal import IMU_ASTRAY, JUMP_GATE, RECEIVER_STEPPED, kind_of, note_jump
+from eskf_ros.filter.integrity.refusal import (
+    IMU_ASTRAY,
+    JUMP_GATE,
+    RECEIVER_STEPPED,
+    is_other_refused,
+    kind_of,
+    note_jump,
+)
 from eskf_ros.filter.integrity.scatter import (
     copy_scatter,
     learn_from_change,
@@ -119,7 +126,7 @@ def fuse_receiver(states, aid, gate, settings, work):
         drifts = weigh_correction(state, heading_variance, work.correction[HEADING])
         worse = weigh_evidence(states, aid, aid.nis, math.log(determinant), humble_nis, humble_log, settings)
         if worse or drifts:
-            reset_to_humble_lane(states)
+            reset_to_humble_lane(states, drifts, work)
             aid.verdict = Verdict.TAKEOVER
     if believed:
         aid.verdict = Verdict.RESET
@@ -153,7 +160,7 @@ def judge_with_humble_lane(states, aid, gate, settings, work):
         linearize(state, aid, settings, work)
         reset_to_message(state, state.trust, aid, True, work)
     elif believed == IMU_ASTRAY:
-        reset_to_humble_lane(states)
+        reset_to_humble_lane(states, is_other_refused(state, aid.stream, aid.source), work)
     elif believed == RECEIVER_STEPPED:
         linearize(state, aid, settings, work)
         reset_to_message(state, state.trust, aid, False, work)

@@ -16,7 +16,7 @@ import numpy as np
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.integrity.scatter import NOTABLE_SCATTER
-from eskf_ros.filter.state.enums import Stream
+from eskf_ros.filter.state.enums import Stream, Verdict
 from eskf_ros.filter.state.error_state import ATTITUDE, SOURCES
 from eskf_ros.filter.state.streams import is_live
 from eskf_ros.filter.state.time import NEVER
@@ -92,9 +92,9 @@ def watch_receiver(state, aid, work, settings):
         watch_fix(state, aid)
     elif aid.stream == Stream.GNSS_VELOCITY:
         watch_velocity(state, aid)
-    if aid.stream == Stream.GNSS_VELOCITY or (
-        aid.stream == Stream.GNSS_POSITION and not is_live(state, Stream.GNSS_VELOCITY.value, aid.source)
-    ):
+    is_alone = aid.stream == Stream.GNSS_POSITION and not is_live(state, Stream.GNSS_VELOCITY.value, aid.source)
+    # Of a filter that has just been replaced the innovation says nothing.
+    if (aid.stream == Stream.GNSS_VELOCITY or is_alone) and aid.verdict != Verdict.TAKEOVER:
         watch_departure(state, aid.source, work)
     if aid.stream == Stream.GNSS_POSITION:
         watch_heading_std(state, settings)

@@ -137,7 +137,7 @@ def offer_epoch(states, aids, first, end, which, settings, work):
                 fused += 1
                 mag.note_field(state, aids[i], FIELD)
     if is_wrong:
-        reset_to_humble_lane(states)
+        reset_to_humble_lane(states, False, work)
         fused_as = Verdict.TAKEOVER.value
     else:
         fused_as = Verdict.FUSED.value
