@@ -16,6 +16,7 @@ import numpy as np
 from eskf_ros.compiled import njit
 from eskf_ros.filter.history.records import XX, YY
 from eskf_ros.filter.integrity.motion_sums import MEMORY, PUSHES, SLOW, TURNS, add_push, add_turn
+from eskf_ros.filter.integrity.refusal import rival_offset
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.time import NEVER, SECOND
 from eskf_ros.geodesy.earth import east_north_up_to_ecef, geodetic_to_ecef
@@ -273,13 +274,16 @@ def watch_step(motion, aid, fix, axes, has_velocity):
 
 @njit
 def offset_by_jumps(state):
-    """Return by how much (m; east, north) the fixes may be off since they jumped, while they are believed.
+    """Return by how much (m; x and y of map) the estimate may be off since the fixes jumped.
 
-    The jump may have been one to the truth; that is not known, and fades.
+    While they are refused, that is how far they are away, once they have agreed for long enough (`rival_offset`). While
+    they are believed, it is the sum of the jumps: one may have been to the truth; that is not known, and fades.
     """
     motion = state.motion
+    if state.trust.refused[0, 0] > 0:
+        return rival_offset(state)
     passed = (state.stamp - motion.offset_stamp) * 1e-9
-    if motion.jumps == 0 or state.trust.refused[0, 0] > 0 or passed > 4.0 * OFFSET_TIME:
+    if motion.jumps == 0 or passed > 4.0 * OFFSET_TIME:
         return 0.0, 0.0
     fades = math.exp(-passed / OFFSET_TIME)
     east, north = fades * motion.offset[0], fades * motion.offset[1]

@@ -38,6 +38,9 @@ SHORT_PATIENCE = 1_000_000_000
 LONG_PATIENCE = 30_000_000_000
 """ns; a stream that stepped aside is believed after this time at the latest."""
 
+RIVAL_TIME = 10_000_000_000
+"""ns; fixes that agree with each other for so long while they are refused may be the right ones."""
+
 OPENED_VELOCITY_STD = 10.0
 """m/s per axis; of a velocity that nothing confirms."""
 
@@ -153,6 +156,21 @@ def is_other_refused(state, stream, source):
 def is_other_agreeing(state, stream, source):
     """Say whether the other kind of message of a receiver comes and agrees with the humble lane."""
     return is_live(state, other_stream(stream), source) and state.trust.refused[1 - kind_of(stream), source] == 0
+
+
+@njit
+def rival_offset(state):
+    """Return how far (m; x and y of map) fixes that are refused, but agree with each other, are from the estimate.
+
+    They are those of the first receiver. Zero before `RIVAL_TIME`, and where other positions are accepted meanwhile:
+    otherwise it is not known which of the two is right.
+    """
+    trust = state.trust
+    lasted = trust.refused_stamp[0, 0] - trust.refused_since[0, 0]
+    is_alone = state.recovery.absolute_stamp < trust.refused_since[0, 0]
+    if trust.refused[0, 0] < FEWEST or lasted < RIVAL_TIME or not is_alone:
+        return 0.0, 0.0
+    return trust.refused_innovation[0, 0, 0], trust.refused_innovation[0, 0, 1]
 
 
 @njit
