@@ -69,7 +69,7 @@ MOTION = np.dtype(
   (m), which fades with `OFFSET_TIME`, up to the last of them (ns): fixes that have jumped back are where they were.
 - ``start_stamp``, ``start_fix``, ``start_way``: a window of positions, and the integral of the velocities over it.
 - ``axes``: sums of the squares (m2) by which velocities differ from the changes of positions, as they are and with east
-  and north exchanged, and the number of windows. ``has_other_axes``: they are exchanged.
+  and north exchanged, and the number of windows in motion. ``has_other_axes``: they are exchanged.
 - ``last_*``: velocity at the end of the window before (positions alone: in its middle), and the integrals over it.
   Where velocities come, windows begin and end with them.
 - ``turns``, ``pushes``: the comparisons.
@@ -108,8 +108,11 @@ LEAST_PAUSE = 0.3
 PAUSE_SIGMAS = 4.0
 """Standard deviations of the difference of two fixes by which the way during a pause must be too short."""
 
-FEWEST_WAYS = 8
-"""Windows from which on the ways by positions and by velocities are compared."""
+FEWEST_WAYS = 3
+"""Windows in motion after which the ways by positions and by velocities are compared."""
+
+LEAST_WAY = 5.0
+"""m; in a window in which the robot has moved less the ways are those of noise."""
 
 OTHER_WAY = 20.0
 """m2; mean square of their difference from which on the axes of the velocities are asked for."""
@@ -390,6 +393,8 @@ def velocity_of_imu(state, settings):
 def compare_axes(motion, change):
     """Add how far the way by the velocities is from that by the positions, as it is and with its axes exchanged."""
     way = motion.start_way
+    if max(math.hypot(way[0], way[1]), math.hypot(change[0], change[1])) < LEAST_WAY:
+        return
     for i in range(3):
         motion.axes[i] *= 1.0 - 1.0 / MEMORY
     motion.axes[0] += (change[0] - way[0]) ** 2 + (change[1] - way[1]) ** 2
