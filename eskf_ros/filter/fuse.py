@@ -11,7 +11,13 @@ from eskf_ros.filter.alignment.heading_sensors import update_unknown_heading
 from eskf_ros.filter.alignment.levelling import reset_level_to_moving
 from eskf_ros.filter.history.timeline import open_record
 from eskf_ros.filter.inertial.navigation_frame import heading_of
-from eskf_ros.filter.integrity.heading_monitor import watch_course, watch_field, watch_given_heading, watch_heading
+from eskf_ros.filter.integrity.heading_monitor import (
+    watch_course,
+    watch_field,
+    watch_given_heading,
+    watch_heading,
+    watch_slip,
+)
 from eskf_ros.filter.integrity.installation_monitor import find_faults, learn_faults
 from eskf_ros.filter.integrity.motion_monitor import watch_motion
 from eskf_ros.filter.integrity.receiver import fuse_receiver, reset_for_new_solution
@@ -139,6 +145,7 @@ def update_motion_evidence(state, aid, settings):
     if aid.stream == Stream.GNSS_POSITION:
         if update_evidence_from_fix(state, aid):
             reset_level_to_moving(state, settings)
+        watch_slip(state, heading_of(state, settings))
     elif aid.stream == Stream.GNSS_VELOCITY:
         if update_evidence_from_velocity(state, aid):
             reset_level_to_moving(state, settings)

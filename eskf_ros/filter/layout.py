@@ -265,7 +265,7 @@ _NEVER = {
     "motion": ("fix_stamp", "heard_stamp", "velocity_stamp", "start_stamp", "last_stamp", "pause_stamp", "clock_stamp"),
     "mag": ("disturbed_stamp",),
     "heading": ("given_stamp", "tried_stamp", "contradicted_since"),
-    "heading_monitor": ("given_stamp", "given_moved"),
+    "heading_monitor": ("given_stamp", "given_moved", "slip_stamp"),
     "rest": (
         "block_end",
         "moving_stamp",

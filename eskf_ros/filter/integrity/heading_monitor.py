@@ -13,14 +13,16 @@ import numpy as np
 from eskf_ros.compiled import njit
 from eskf_ros.filter.history.records import XX, YY
 from eskf_ros.filter.state.enums import Stream
-from eskf_ros.filter.state.error_state import ATTITUDE
+from eskf_ros.filter.state.error_state import ATTITUDE, VELOCITY
 from eskf_ros.filter.state.time import NEVER, SECOND
-from eskf_ros.geodesy.rotation import wrapped
+from eskf_ros.geodesy.rotation import dot, wrapped
 
 HEADING_MONITOR = np.dtype(
     [
         ("sensor_contrast", "f8", (2, 3)),
         ("course_contrast", "f8", (3,)),
+        ("slip", "f8", (4,)),
+        ("slip_stamp", "i8"),
         ("field_found", "f8", (2,)),
         ("disturbed_fields", "f8"),
         ("field_count", "f8"),
@@ -35,7 +37,9 @@ HEADING_MONITOR = np.dtype(
 """Differences of headings from the estimate, and disturbed fields; sums and counts forget exponentially (`MEMORY`).
 
 ``sensor_contrast``: sums of the cosine and the sine of the difference, and their number, for the dual antenna (0) and
-the magnetometer (1); ``course_contrast``: the same for the course over ground. ``field_found``: strength (T) and
+the magnetometer (1); ``course_contrast``: the same for the course over ground. ``slip``, ``slip_stamp``: of the
+direction of travel to x of base_link, by the estimate, the sums of the weights (1/rad2), of the weighed angles (1/rad)
+and of their weighed squares, how many there were, and the last one (ns). ``field_found``: strength (T) and
 inclination (rad) of the field last measured; ``disturbed_fields``, ``field_count``: disturbed readings, and all.
 
 ``given_stamp``, ``given_std``: when the heading was given that is watched (ns), and its standard deviation (rad).
@@ -58,6 +62,27 @@ FAR_OFF_DEG = 30.0
 
 FIRST_MOTION = 90 * SECOND
 """ns; of motion, within which a heading that was given and is wrong is corrected."""
+
+SLIP_INTERVAL = SECOND
+"""ns; the direction of travel is asked for so often."""
+
+SLIP_TIME = 10.0
+"""s; time for which an error of the direction of travel by the estimate lasts, so that ten of them are one."""
+
+SLIP_MEMORY = 300.0
+"""Directions of travel that are remembered, about."""
+
+SLIP_SPEED, SLIP_RATE = 3.0, 0.05
+"""m/s and rad/s; slower, or in a sharper turn, the direction of travel is not asked for."""
+
+SLIP_STD = math.radians(1.0)
+"""rad; by which a vehicle travels beside its axis for a while: camber, wind, tyres."""
+
+FEWEST_SLIPS = 30
+"""Directions of travel from which on they are judged."""
+
+LARGEST_SPREAD = math.radians(5.0)
+"""rad; standard deviation of the directions of travel of a robot that is made to travel in one."""
 
 WRONG_SIGMAS, LEAST_WRONG = 4.0, math.radians(15.0)
 """Standard deviations and rad by which a heading that was given must have been corrected to be called wrong."""
@@ -96,6 +121,28 @@ def watch_course(state, aid, heading, settings):
     fast = math.hypot(east, north) > max(settings.course_min_speed, 10.0 * std)
     if settings.use_course == 1 and state.heading_known == 1 and fast:
         note_contrast(state.heading_monitor.course_contrast, wrapped(math.atan2(north, east) - heading))
+
+
+@njit
+def watch_slip(state, heading):
+    """Add the direction in which the estimate travels to its ``heading`` (rad), at a fix, straight ahead."""
+    monitor = state.heading_monitor
+    if state.heading_known == 0 or state.stamp - monitor.slip_stamp < SLIP_INTERVAL:
+        return
+    east, north, covariance = state.velocity_map[0], state.velocity_map[1], state.covariance
+    speed, rate, bias = math.hypot(east, north), state.imu.smooth_rate, state.gyro_bias
+    turn = (rate[0] - bias[0], rate[1] - bias[1], rate[2] - bias[2])
+    if speed < SLIP_SPEED or dot(turn, turn) > SLIP_RATE**2:
+        return
+    monitor.slip_stamp = state.stamp
+    across = max(covariance[VELOCITY, VELOCITY], covariance[VELOCITY + 1, VELOCITY + 1]) / speed**2
+    weight = 1.0 / (SLIP_TIME * (across + covariance[ATTITUDE + 2, ATTITUDE + 2] + SLIP_STD**2))
+    remains = 1.0 - 1.0 / SLIP_MEMORY
+    slip = wrapped(math.atan2(north, east) - heading)
+    monitor.slip[0] = remains * monitor.slip[0] + weight
+    monitor.slip[1] = remains * monitor.slip[1] + weight * slip
+    monitor.slip[2] = remains * monitor.slip[2] + weight * slip * slip
+    monitor.slip[3] += 1.0
 
 
 @njit
@@ -153,6 +200,21 @@ def _lasting_difference(sums: np.ndarray) -> float | None:
 def is_heading_contradicted(state: np.void) -> bool:
     """Say whether the dual antenna or the magnetometer has a lasting difference from the estimated heading."""
     return any(has_lasting_difference(sums) for sums in state["heading_monitor"]["sensor_contrast"])
+
+
+def slip_of(state: np.void) -> tuple[float, float] | None:
+    """Return the direction of travel to x of base_link by the estimate, and its standard deviation (rad).
+
+    None where it is not known, or changes: not every robot is made to travel in one direction.
+    """
+    weight, total, square, count = (float(value) for value in state["heading_monitor"]["slip"])
+    if count < FEWEST_SLIPS or not state["heading_known"]:
+        return None
+    mean = total / weight
+    if square / weight - mean * mean > LARGEST_SPREAD**2:
+        return None
+    # The error of the heading is the same all the time.
+    return mean, math.sqrt(1.0 / weight + float(state["covariance"][ATTITUDE + 2, ATTITUDE + 2]))
 
 
 def given_heading_complaints(state: np.void) -> list[str]:

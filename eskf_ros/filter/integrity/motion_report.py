@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from eskf_ros.filter.integrity.heading_monitor import slip_of
 from eskf_ros.filter.integrity.motion_sums import FEWEST_TURNS, SAME, TURNED
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.time import SECOND
@@ -126,19 +127,25 @@ def _push_complaints(pushes: np.void) -> list[str]:
 def travel_complaints(state: np.void, settings: np.void, mount_rpy_deg: Sequence[float]) -> tuple[list[str], bool]:
     """Return a sentence if the robot does not travel along x of base_link, and whether it is told to do so.
 
-    Only a robot that is made to travel along x is mounted wrong then.
+    Only a robot that is made to travel along x is mounted wrong then. Where positions alone do not show accelerations,
+    the estimate shows the direction of travel.
     """
-    compared = _compared(state["motion"]["pushes"])
-    if compared is None or motion_complaints(state):
+    compared, slip = _compared(state["motion"]["pushes"]), slip_of(state)
+    if motion_complaints(state):
         return [], False
-    matrix, std = compared
-    yaw = -math.atan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1])
+    if compared is not None:
+        matrix, std = compared
+        yaw, what = -math.atan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1]), "accelerations"
+    elif slip is not None:
+        (yaw, std), what = (-slip[0], slip[1]), "velocity"
+    else:
+        return [], False
     if abs(yaw) < max(NOTABLE_YAW, YAW_SIGMAS * std):
         return [], False
     roll, pitch, told = mount_rpy_deg
     wanted = (told + math.degrees(yaw) + 180.0) % 360.0 - 180.0
     text = (
-        f"by its accelerations the robot travels at {-math.degrees(yaw):+.1f} deg (+- {math.degrees(std):.1f}) to x of "
+        f"by its {what} the robot travels at {-math.degrees(yaw):+.1f} deg (+- {math.degrees(std):.1f}) to x of "
         f"base_link: if it is made to travel along x, set imu.mount_rpy_deg to [{roll:g}, {pitch:g}, {wanted:.1f}]"
     )
     return [text], bool(settings["use_course"]) or bool(settings["constrains"][Stream.NHC])
