@@ -60,7 +60,7 @@ ALIKE = 0.9
 FAR_OFF_DEG = 30.0
 """deg; smaller mean differences of headings are not reported."""
 
-FIRST_MOTION = 90 * SECOND
+FIRST_MOTION = 180 * SECOND
 """ns; of motion, within which a heading that was given and is wrong is corrected."""
 
 SLIP_INTERVAL = SECOND

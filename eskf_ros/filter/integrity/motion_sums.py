@@ -73,6 +73,9 @@ TURNED = 0.4
 SAME = 0.7
 """Correlation of changes of course with a gyro from which on it shows them."""
 
+HELD = 0.7
+"""Share of the limits of a lag beyond which it stays once it is known."""
+
 NOTABLE_LAG = 0.6
 """s; a time between course and gyro from which on it is told: less is found by the installation monitor."""
 
@@ -121,7 +124,10 @@ def lag_of(turns, length):
     gyro_square = turns.gyro_square[2] - turns.gyro[2] ** 2 / turns.weight
     largest = max(max(before, after), same - turns.gyro[2] * turns.course / turns.weight)
     lag = 0.5 * (after - before) / bend * length
-    return lag if abs(lag) > NOTABLE_LAG and largest > SAME * math.sqrt(gyro_square * square) else 0.0
+    # What has been told is held unless the turns speak against it.
+    held = HELD if turns.lag * lag > 0.0 else 1.0
+    is_shown = largest > held * SAME * math.sqrt(gyro_square * square)
+    return lag if abs(lag) > held * NOTABLE_LAG and is_shown else 0.0
 
 
 @njit

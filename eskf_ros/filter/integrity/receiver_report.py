@@ -17,6 +17,7 @@ from eskf_ros.filter.integrity.receiver_monitor import (
     MANY_FIXES,
     UNLIKELY,
 )
+from eskf_ros.filter.integrity.sample_report import stamp_complaints
 from eskf_ros.filter.measurements.stamp_noise import FEWEST_CUT
 from eskf_ros.filter.state.error_state import SOURCES
 
@@ -69,7 +70,7 @@ def aid_complaints(state: np.void, settings: np.void, is_explained: bool, is_imu
         lies = _covariance_complaints(state, source, scale, _may_be_late(state, source))
         # Fixes that scatter seem to jump.
         paths = [] if lies else _path_complaints(state, source)
-        is_doubtful = is_imu_doubtful or bool(paths) or _departures(state, source) >= FEW_DEPARTURES
+        is_doubtful = is_imu_doubtful or bool(paths) or _has_calm_errors(state, source) or _departures(state, source) >= FEW_DEPARTURES
         faults = _fault_complaints(state, settings, source, is_doubtful)
         # Those faults explain drifts, contradictions and a high NIS: no sentences of their own.
         found += paths + faults + lies
@@ -176,13 +177,19 @@ def aid_notes(state: np.void) -> list[str]:
     for source in range(SOURCES):
         if state["scatter"]["cut_stamps"][source] >= FEWEST_CUT:
             continue
-        change, pairs = float(state["scatter"]["change"][source]), float(state["scatter"]["pairs"][source])
-        if pairs > 2 * MANY_FIXES and state["scatter"]["calm"][source] > NOTABLE_CALM:
+        change = float(state["scatter"]["change"][source])
+        if _has_calm_errors(state, source):
             found.append(
                 f"the fixes{_of(source)} change by {math.sqrt(change):.2f} times what they claim from one to the next: "
                 "their errors last. This is allowed for (gnss.correlation_time, gnss.correlated_share)"
             )
     return found
+
+
+def _has_calm_errors(state: np.void, source: int) -> bool:
+    """Say whether the fixes of a receiver err together for long: such errors look like faults of the installation."""
+    pairs = float(state["scatter"]["pairs"][source])
+    return bool(pairs > 2 * MANY_FIXES and state["scatter"]["calm"][source] > NOTABLE_CALM)
 
 
 def _velocity_complaints(state: np.void, source: int) -> list[str]:
@@ -242,9 +249,10 @@ def _departure_complaints(state: np.void, source: int) -> list[str]:
         return []
     if not departures:
         stamp = int(state["trust"]["doubt_stamp"])
+    of_stamps = "; or the stamps of the IMU, which jitter, are why" if stamp_complaints(state) else ""
     return [
         f"the receiver{_of(source)} and the IMU went different ways {departures + takeovers} times, once at the stamp "
-        f"{stamp * 1e-9:.1f}: multipath or spoofing; or {NOISY_IMU}"
+        f"{stamp * 1e-9:.1f}: multipath or spoofing; or {NOISY_IMU}{of_stamps}"
     ]
 
 
