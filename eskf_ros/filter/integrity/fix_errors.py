@@ -59,24 +59,28 @@ def update_shares(state, lane, source, settings, work):
     scatter.walking[source] = scatter.walk[source] if walks else 0.0
     new = change - 0.5 * scatter.walking[source]
     scatter.white[source] = new if new > NOTABLE_SCATTER else 1.0
-    update_lasting_share(state, lane, source, used, settings, work)
     calm = 1.0 - change if change < NOTABLE_CALM else 0.0
     if walks:
         interval = max(1e-9 * state.recovery.absolute_interval, LEAST_INTERVAL)
         # A Gauss-Markov error of variance v walks by 2 v / time in a second.
         steps = 1.0 / (settings.optional_decay[settings.position_error_at - ERROR_SIZE] * interval)
         calm = min(0.5 * scatter.walk[source] * steps, LARGEST_SPREAD)
+    update_lasting_share(state, lane, source, used, calm, settings, work)
     scatter.calm[source] = calm if scatter.lasting[source] == 0.0 else 0.0
 
 
 @njit
-def update_lasting_share(state, lane, source, used, settings, work):
-    """Update the share of the lasting error that is estimated; ``used`` is the new share in ``work.noise``."""
+def update_lasting_share(state, lane, source, used, calm, settings, work):
+    """Update the share of the lasting error that is estimated; ``used`` is the new share in ``work.noise``.
+
+    Fixes that walk are away from the path because it follows them late: no more of that is estimated than the position
+    is held to be off with them, ``calm``.
+    """
     scatter = state.scatter
     white, spread, lasting = scatter.white[source], scatter.spread[source], scatter.lasting[source]
     found = max(spread if spread > NOTABLE_SCATTER else 1.0, white) - white
     found = max(found, lasting * largest_square(state, settings.position_error_at) / LARGEST_VALUE**2)
-    found = found if found > LEAST_LASTING * white else 0.0
+    found = found if found > max(LEAST_LASTING * white, calm) else 0.0
     if found <= STEADY * lasting and found * STEADY >= lasting:
         return
     scatter.lasting[source] = found
