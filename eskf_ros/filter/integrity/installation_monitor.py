@@ -50,6 +50,9 @@ CONSIDERED_SIGMAS = 3.0
 """Standard deviations from zero beyond which what faults do to an error is allowed for: to be wrong costs certainty
 only."""
 
+FOUND_SIGMAS = 1.0
+"""The same once a fault is certain (`FAULT_SIGMAS`): what is left of it at the moment is allowed for, too."""
+
 LEVER_ARM_ERROR = 0.05
 """m; smaller errors of the lever arm are not reported."""
 
@@ -170,6 +173,10 @@ def update_considered(state, source):
     installation = state.installation
     absorbed, estimate = installation.absorbed[source], installation.estimate[source]
     covariance = installation.covariance[source]
+    is_found = False
+    for k in range(FAULTS):
+        is_found |= installation.found[source, k] != 0.0
+    sigmas = FOUND_SIGMAS if is_found else CONSIDERED_SIGMAS
     installation.is_considered[source] = 0
     for i in range(ERROR_SIZE):
         effect, variance = 0.0, 0.0
@@ -177,7 +184,7 @@ def update_considered(state, source):
             effect += absorbed[i, k] * estimate[k]
             for m in range(FAULTS):
                 variance += absorbed[i, k] * covariance[k, m] * absorbed[i, m]
-        is_certain = effect * effect > CONSIDERED_SIGMAS**2 * variance
+        is_certain = effect * effect > sigmas**2 * variance
         installation.considered[source, i] = effect if is_certain else 0.0
         if is_certain:
             installation.is_considered[source] = 1
