@@ -77,6 +77,9 @@ TRUST = np.dtype(
 EVIDENCE = 20.0
 """Log likelihood ratio from which on the filter is wrong: by chance once in exp(20) messages."""
 
+EXPECTED_NIS = 7.81
+"""NIS of 3 scalars in the humble lane beyond which a message surprises it: the chi-square quantile of 0.95."""
+
 LARGEST_NIS = 30.0
 """A single innovation counts with at most this NIS in the likelihoods: wild messages are not evidence."""
 
@@ -278,12 +281,15 @@ def reset_block(lane, block):
 def weigh_evidence(states, aid, nis, log_determinant, humble_nis, humble_log_determinant, settings):
     """Compare how well the lanes predicted a message; say whether the filter has been worse for too long.
 
-    Both innovations with their covariances: NIS and logarithm of the determinant.
+    Both innovations with their covariances: NIS and logarithm of the determinant. A message that surprises the humble
+    lane, too, is noisier than it claims, and says less by that much.
     """
     state = states[FILTER]
     update_doubt(state)
     if kind_of(aid.stream) == 1 or not is_live(state, other_stream(aid.stream), receiver_of(aid)):
-        ratio = min(nis, LARGEST_NIS) + log_determinant - min(humble_nis, LARGEST_NIS) - humble_log_determinant
+        surprise = max(1.0, humble_nis / EXPECTED_NIS)
+        ratio = (min(nis, LARGEST_NIS) - min(humble_nis, LARGEST_NIS)) / surprise
+        ratio += log_determinant - humble_log_determinant
         state.trust.evidence = max(0.0, state.trust.evidence + 0.5 * ratio)
     return state.trust.evidence >= EVIDENCE or is_heading_apart(states, settings)
 
