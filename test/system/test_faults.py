@@ -13,7 +13,7 @@ import pytest
 from campaign.advice import advice_of
 from campaign.causes import causes_of, is_named, is_wrong
 from campaign.document import replace_section
-from campaign.fault import DEFAULT_VELOCITY, TOLD_POSITION, TOLD_VELOCITY, Fault, Filter, Kind
+from campaign.fault import DEFAULT_POSITION, DEFAULT_VELOCITY, TOLD_POSITION, TOLD_VELOCITY, Fault, Filter, Kind
 from campaign.independent import FOLDER, recording_from
 from campaign.judge import Figures, Row, figures_of, summary
 from campaign.running import Trace, heading_at_start_deg, parameters_of, recording_of, run_one
@@ -105,6 +105,35 @@ def test_a_fault_is_named_and_no_other(name: str) -> None:
     figures = figures_of(BY_NAME[name], run_named(name, DEFAULT_VELOCITY))
     assert math.isfinite(figures.named_after)
     assert not figures.wrong
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "seed"),
+    [
+        ("IMU yaw 8 deg off", DEFAULT_POSITION, 0),
+        ("IMU yaw 5 deg off", TOLD_POSITION, 1),
+        ("stamps jittered by 0 ms, late by 1 ms", TOLD_VELOCITY, 0),
+        ("heading given 70 deg wrong", TOLD_POSITION, 0),
+        ("clocks of IMU and receiver 1.2 s apart", TOLD_POSITION, 1),
+        ("RTK claims 1 cm and wanders 0.3 m: boat", DEFAULT_VELOCITY, 0),
+    ],
+)
+def test_a_fault_is_named_where_others_look_like_it(name: str, given: Filter, seed: int) -> None:
+    figures = figures_of(BY_NAME[name], run_named(name, given, seed))
+    assert math.isfinite(figures.named_after)
+    assert not figures.wrong
+
+
+def test_a_multirotor_that_flies_sideways_is_not_said_to_be_mounted_wrong() -> None:
+    assert run_named("clean: long_flight", DEFAULT_VELOCITY).said == {}
+
+
+def test_velocities_in_other_axes_are_named_within_ten_seconds_of_motion() -> None:
+    """They lead the filter away by twice the speed: each second counts."""
+    name = "velocity in north, east, down"
+    trace = run_named(name, TOLD_VELOCITY)
+    moving = trace.seconds[np.argmax(trace.speed > 3.0)]
+    assert figures_of(BY_NAME[name], trace).named_after < moving + 10.0 + 5.0 - BY_NAME[name].begin
 
 
 @pytest.mark.parametrize(

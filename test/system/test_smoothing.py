@@ -204,7 +204,7 @@ TOKYO_NHC = (NHC, *REAR_AXLE)
         ((WITHOUT_VELOCITY,), 0.34, 2.6),
         pytest.param((WITHOUT_VELOCITY, *TOKYO_NHC), 0.25, 0.78, marks=THREE_OUTAGES),
         ((), 0.34, 2.6),
-        pytest.param(TOKYO_NHC, 0.25, 0.78, marks=pytest.mark.xfail(reason="0.80 m at 95 %", strict=False)),
+        (TOKYO_NHC, 0.25, 0.78),
     ],
     ids=["positions", "positions-nhc", "velocities", "velocities-nhc"],
 )

@@ -279,17 +279,20 @@ def watch_step(motion, aid, fix, axes, has_velocity):
 def offset_by_jumps(state):
     """Return by how much (m; x and y of map) the estimate may be off since the fixes jumped.
 
-    While they are refused, that is how far they are away, once they have agreed for long enough (`rival_offset`). While
-    they are believed, it is the sum of the jumps: one may have been to the truth; that is not known, and fades.
+    The fixes may be off by the sum of their jumps: one may have been to the truth; that is not known, and fades. The
+    estimate is off by as much, less by how far refused fixes are away. Once these have agreed for long enough, they may
+    be right (`rival_offset`).
     """
     motion = state.motion
-    if state.trust.refused[0, 0] > 0:
-        return rival_offset(state)
+    east, north = rival_offset(state)
     passed = (state.stamp - motion.offset_stamp) * 1e-9
-    if motion.jumps == 0 or passed > 4.0 * OFFSET_TIME:
-        return 0.0, 0.0
+    if east != 0.0 or north != 0.0 or motion.jumps == 0 or passed > 4.0 * OFFSET_TIME:
+        return east, north
     fades = math.exp(-passed / OFFSET_TIME)
     east, north = fades * motion.offset[0], fades * motion.offset[1]
+    if state.trust.refused[0, 0] > 0:
+        east -= state.trust.refused_innovation[0, 0, 0]
+        north -= state.trust.refused_innovation[0, 0, 1]
     return (east, north) if math.hypot(east, north) > LEAST_JUMP else (0.0, 0.0)
 
 
