@@ -3,6 +3,8 @@
     python benchmark/peers.py [--export DIR]                                    # the drives of docs/peers.md
     python benchmark/peers.py BAG --config FILE --truth TOPIC [--outage S:L] [--export DIR]
 
+A parameter file with `mode: tight` compares tightly coupled filters, by the ranges of GPS alone (see `peers_tight.py`).
+
 Needs sidereon and, for the last column, evo (both on PyPI). `--export` leaves each recording as KF-GINS, RTKLIB,
 sidereon and evo read it. Without BAG the table goes to docs/peers.md, else to the terminal.
 """
@@ -14,7 +16,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -37,10 +39,12 @@ from eskf_ros.replay.summary import truth_result
 from eskf_ros.replay.topics import find_topics, truth_converter
 from eskf_ros.replay.truth import TruthComparison
 from eskf_ros.simulate.main import main as simulate_bag
+from eskf_ros.simulate.range_receiver import RangeReceiver
 from eskf_ros.simulate.scenario import simulate
 from markdown_table import table
 from peers_export import export, write_tum
 from peers_sidereon import SECOND, GaveUpError, Inputs, Run, gyro_bias_at_rest, run_loose
+from peers_tight import GpsIntake, run_tight
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENT = ROOT / "docs" / "peers.md"
@@ -55,22 +59,20 @@ HEADINGS = (
     "us per sample",
     "evo APE rms, m",
 )
-SIDEREON = (
-    ("sidereon loose EKF", "EKF", False),
-    ("sidereon loose EKF, gyro bias held at ours", "EKF", True),
-)
+HOLDS_GYRO_BIAS = (("", False), (", gyro bias held at ours", True))
+"""How sidereon is run, with what is added to its name."""
 NOT_RUN = (
-    ("sidereon tight", "ranges are not exported; its model of the gyro bias is that of the loose one"),
     ("KF-GINS", "C++ source, no package; `kf-gins.yaml` and its two files are exported"),
     ("robot_localization, FusionCore", "C++ nodes of ROS 2, not on PyPI"),
 )
+CITY_OUTAGES = ((110.0, 30.0), (180.0, 30.0), (250.0, 30.0))
 HEADING_STD_DEG = 3.0
 """The comparison starts when our heading is known this well: others cannot start by themselves."""
 
 sys.path.insert(0, str(ROOT / "test"))
 
 from support.data import find_data_folder  # noqa: E402
-from support.recordings import drive_0708  # noqa: E402
+from support.recordings import drive_0708, tsukishima, walk  # noqa: E402
 
 Outages = tuple[tuple[float, float], ...]
 
@@ -88,7 +90,10 @@ class Drive:
 
 @dataclass(frozen=True)
 class Ours:
-    """Our rows from the start of the comparison on, truth epochs after it, the point that these are of, the datum."""
+    """Our rows from the start of the comparison on, truth epochs after it, the point that these are of, the datum.
+
+    ``intake``: what was heard of the satellites, in mode tight.
+    """
 
     run: Run
     start: NDArray[Any]
@@ -96,6 +101,7 @@ class Ours:
     point: tuple[float, ...]
     datum: tuple[float, float, float]
     first_stamp: int
+    intake: GpsIntake | None
 
 
 def run_ours(drive: Drive) -> Ours:
@@ -106,7 +112,8 @@ def run_ours(drive: Drive) -> Ours:
         topics, _ = find_topics(reader, drive.bag, parameters, drive.truth)
         to_epochs = truth_converter(topics, drive.bag, parameters)
         navigator = Navigator(parameters, output_rate=0.0)
-        feed = Feed(navigator, topics, outages=drive.outages)
+        intake = GpsIntake(navigator, parameters) if parameters.mode == "tight" else None
+        feed = Feed(navigator, topics, outages=drive.outages, intake=intake)
         epochs = []
         for batch in feed.ordered(reader.batches(topics.wanted())):
             began = time.process_time()
@@ -129,12 +136,13 @@ def run_ours(drive: Drive) -> Ours:
         point=parameters.gnss.lever_arm if topics.truth_type == FIX else (0.0, 0.0, 0.0),
         datum=navigator.datum,
         first_stamp=feed.first_stamp,
+        intake=intake,
     )
 
 
 def inputs_of(drive: Drive, first_stamp: int) -> Inputs:
     """What other filters are given: the same messages by stamp, without delays, and without those withheld."""
-    tables = read_bag(drive.bag, drive.parameters)
+    tables = read_bag(drive.bag, replace(drive.parameters, mode="loose"))
     imu, fix = tables["imu"], tables["gnss_position"]
     seconds = (fix["stamp"] - first_stamp) / SECOND
     kept = fix["status"] >= 0
@@ -220,6 +228,13 @@ def evo_error(estimate: Path, truth: Path, point: tuple[float, ...]) -> str:
     return f"{error.get_statistic(metrics.StatisticsType.rmse):.2f}"
 
 
+def run_sidereon(drive: Drive, ours: Ours, inputs: Inputs, frame: MapFrame, holds_gyro_bias: bool) -> Run:
+    """Run the filter of sidereon that is coupled as ours is."""
+    if ours.intake is None:
+        return run_loose(inputs, ours.start, frame, drive.parameters, "EKF", holds_gyro_bias)
+    return run_tight(inputs, ours.intake, ours.run.rows, ours.start, frame, drive.parameters, holds_gyro_bias)
+
+
 def compared_drive(drive: Drive, folder: Path) -> str:
     """Table of a drive; its exports lie in the folder afterwards."""
     run_ours(drive)  # What has to be compiled or loaded is not of the estimator.
@@ -228,9 +243,10 @@ def compared_drive(drive: Drive, folder: Path) -> str:
     export(folder, inputs, ours.start, frame, drive.parameters)
     write_truth(folder, ours)
     rows = [scored("eskf_ros", ours.run, ours, drive, folder)]
-    for name, kind, holds_gyro_bias in SIDEREON:
+    for suffix, holds_gyro_bias in HOLDS_GYRO_BIAS:
+        name = f"sidereon {drive.parameters.mode} EKF{suffix}"
         try:
-            run = run_loose(inputs, ours.start, frame, drive.parameters, kind, holds_gyro_bias)
+            run = run_sidereon(drive, ours, inputs, frame, holds_gyro_bias)
         except ImportError:
             rows.append([name, "not installed", *["-"] * (len(HEADINGS) - 2)])
             continue
@@ -238,7 +254,8 @@ def compared_drive(drive: Drive, folder: Path) -> str:
             rows.append([name, f"gave up: {error}", *["-"] * (len(HEADINGS) - 2)])
             continue
         rows.append(scored(name, run, ours, drive, folder))
-    rows += [[name, f"not run: {why}", *["-"] * (len(HEADINGS) - 2)] for name, why in NOT_RUN]
+    if ours.intake is None:
+        rows += [[name, f"not run: {why}", *["-"] * (len(HEADINGS) - 2)] for name, why in NOT_RUN]
     return f"### {drive.title}\n\n{table(HEADINGS, rows)}\n"
 
 
@@ -256,7 +273,7 @@ def at_rest() -> str:
 
 
 def our_drives(folder: Path) -> list[Drive]:
-    """The drives of docs/peers.md: the bundled one, simulated ones with outages, and a real one if it is there."""
+    """The drives of docs/peers.md: the bundled one, simulated ones with outages, and real ones if they are there."""
     tunnel = Drive(
         "Bundled drive through a tunnel of 45 s (simulated, industrial IMU, fixes of 1 m and velocities)",
         ROOT / "bags" / "tunnel_drive.mcap",
@@ -270,16 +287,47 @@ def our_drives(folder: Path) -> list[Drive]:
         simulate_bag(["drive", "--grade", grade, "--seed", str(seed), "--out", str(bag), "--quiet"])
         parameters = from_mapping(simulate("drive", seed, grade=grade).parameters())
         title = f"City drive (simulated, {grade} IMU, fixes of 1 m and velocities), three outages of 30 s"
-        found.append(Drive(title, bag, parameters, "truth", ((110.0, 30.0), (180.0, 30.0), (250.0, 30.0))))
-    try:
-        source = find_data_folder("drive_0708")
-    except FileNotFoundError as error:
-        print(error, file=sys.stderr)
-        return found
-    recording = drive_0708.drive_0708_recording(folder, source, with_velocity=False)
-    parameters = load(recording.config((), chosen_noise=True))
+        found.append(Drive(title, bag, parameters, "truth", CITY_OUTAGES))
+    found.append(simulated_ranges(folder))
+    for real in (real_fixes, real_city_ranges, real_walk_ranges):
+        try:
+            found.append(real(folder))
+        except FileNotFoundError as error:
+            print(error, file=sys.stderr)
+    return found
+
+
+def simulated_ranges(folder: Path) -> Drive:
+    """A city drive with ranges of GPS."""
+    bag, receiver = folder / "drive_ranges.mcap", RangeReceiver(systems="G")
+    options = ["--grade", "industrial", "--seed", "2", "--sensor", "ranges:systems=G"]
+    simulate_bag(["drive", *options, "--out", str(bag), "--quiet"])
+    mapping = simulate("drive", 2, grade="industrial", ranges=receiver).parameters()
+    title = "Tight: city drive (simulated, industrial IMU, ranges of GPS), three outages of 30 s"
+    return Drive(title, bag, from_mapping({**mapping, "mode": "tight"}), "truth", CITY_OUTAGES)
+
+
+def real_fixes(folder: Path) -> Drive:
+    """drive_0708 with its positions."""
+    recording = drive_0708.drive_0708_recording(folder, find_data_folder("drive_0708"), with_velocity=False)
     title = "drive_0708 (real, consumer IMU, RTK positions at 1 Hz), outages of 15 s every 45 s"
-    return [*found, Drive(title, recording.bag, parameters, "truth", drive_0708.OUTAGE_SETS[0])]
+    parameters = load(recording.config((), chosen_noise=True))
+    return Drive(title, recording.bag, parameters, "truth", drive_0708.OUTAGE_SETS[0])
+
+
+def real_city_ranges(folder: Path) -> Drive:
+    """The part of tsukishima with ranges; truth without the constant between them and the RTK positions."""
+    recording = tsukishima.tsukishima_ranges_recording(folder, find_data_folder("tsukishima_20201105"))
+    lines = ("mode: tight", f"ranges.time_offset: {tsukishima.TIME_OFFSET}", "wheel.use: false")
+    title = "Tight: tsukishima (real, MEMS IMU, ranges of GPS on L1 between tall buildings)"
+    return Drive(title, recording.bag, load(recording.config(lines, chosen_noise=True)), "truth_shifted", ())
+
+
+def real_walk_ranges(folder: Path) -> Drive:
+    """walk_0827 with the ranges of the four GPS satellites whose ephemerides it has."""
+    recording = walk.walk_ranges_recording(folder, find_data_folder("walk_0827"))
+    title = "Tight: walk_0827 (real, IMU in the hand, ranges of four GPS satellites)"
+    return Drive(title, recording.bag, load(recording.config(("mode: tight",), chosen_noise=True)), "truth", ())
 
 
 def _outage(text: str) -> tuple[float, float]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,8 +23,9 @@ SECOND = 1_000_000_000
 BIAS_TIME = 1e6
 """s; correlation time of the biases where these are Gauss-Markov: long, as ours walk at random and forget nothing."""
 
-HELD = 1e-9
-"""rad/s; standard deviation of a gyro bias that is to stay as it is."""
+HELD = 1e-7
+"""rad/s; standard deviation of a gyro bias that is to stay as it is. Beside the variance with which the receiver clock
+starts, sidereon takes smaller ones for rounding errors and gives up."""
 
 SATELLITES = 10
 """Number of satellites that is told with a fix; NavSatFix does not have it."""
@@ -63,16 +66,26 @@ def imu_to_base(parameters: Parameters) -> Array:
     return np.asarray(Rotation.from_euler("xyz", parameters.imu.mount_rpy_deg, degrees=True).as_matrix())
 
 
-def _filter(
-    sidereon: Any, kind: str, start: NDArray[Any], frame: MapFrame, parameters: Parameters, holds_gyro_bias: bool
+def new_filter(
+    kind: str,
+    start: NDArray[Any],
+    frame: MapFrame,
+    parameters: Parameters,
+    holds_gyro_bias: bool,
+    seconds: float = 0.0,
 ) -> Any:
-    """A filter that starts from our own estimate at one row, with its covariance but for what correlates its parts."""
+    """A filter that starts from our own estimate at one row, with its covariance but for what correlates its parts.
+
+    ``seconds``: its time at that row. A loosely coupled filter needs no date, and small numbers keep their digits.
+    """
+    import sidereon
+
     turn = imu_to_base(parameters)
     base_to_ecef = frame.rotation_map_to_ecef @ _matrix(start["attitude_body_to_map"])
     position = frame.to_ecef(start["position_map"][None])[0] + base_to_ecef @ parameters.imu.mount_position
     velocity = frame.rotation_map_to_ecef @ start["velocity_map"]
     nominal = sidereon.NavState(
-        0.0,  # A loosely coupled filter needs no date, and small numbers keep their digits.
+        seconds,
         position.tolist(),
         velocity.tolist(),
         base_to_ecef @ turn,
@@ -102,6 +115,11 @@ def _filter(
         spec,
         filter_kind=getattr(sidereon.FusionFilterKind, kind),
         loose=sidereon.LooseCouplingConfig(lever_arm_body_m=lever.tolist()),
+        tight=sidereon.TightCouplingConfig(
+            lever_arm_body_m=lever.tolist(),
+            clock_bias_random_walk_m2_s=parameters.ranges.clock_bias_noise**2,
+            clock_drift_random_walk_m2_s3=parameters.ranges.clock_drift_noise**2,
+        ),
     )
     return sidereon.InertialFilter.with_config(state, config)
 
@@ -139,39 +157,56 @@ def run_loose(
     kind: str,
     holds_gyro_bias: bool = False,
 ) -> Run:
-    """Run the loosely coupled filter (kind: EKF or UKF) from the row `start` of our estimate on.
-
-    Fixes come at their own time: the readings are interpolated there, and an interval is cut in two.
-    """
+    """Run the loosely coupled filter (kind: EKF or UKF) from the row `start` of our estimate on."""
     import sidereon
 
     begin = int(start["stamp"])
-    stamps = np.union1d(inputs.stamp[inputs.stamp >= begin], inputs.fix_stamp[inputs.fix_stamp > begin])
-    stamps = stamps[stamps <= inputs.stamp[-1]]
+    engine = new_filter(kind, start, frame, parameters, holds_gyro_bias)
+    updates = {
+        int(stamp): partial(engine.update_loose, _measurement(sidereon, inputs, index, (int(stamp) - begin) / SECOND))
+        for index, stamp in enumerate(inputs.fix_stamp)
+    }
+    return driven(engine, inputs, begin, 0.0, updates, frame, parameters)
+
+
+def driven(
+    engine: Any,
+    inputs: Inputs,
+    begin: int,
+    seconds: float,
+    updates: Mapping[int, Callable[[], Any]],
+    frame: MapFrame,
+    parameters: Parameters,
+) -> Run:
+    """Drive a filter, whose time is `seconds` at the stamp `begin`, with the IMU and with updates by their stamp (ns).
+
+    Updates come at their own time: the readings are interpolated there, and an interval is cut in two.
+    """
+    import sidereon
+
+    stamps = np.union1d(inputs.stamp, np.array([begin, *updates], np.int64))
+    stamps = stamps[(stamps >= begin) & (stamps <= inputs.stamp[-1])]
     since = (inputs.stamp - begin) / SECOND
     at = (stamps - begin) / SECOND
     force, rate = (
         np.column_stack([np.interp(at, since, axis) for axis in values.T]) for values in (inputs.force, inputs.rate)
     )
-    steps = np.diff(at)
+    # sidereon refuses an interval that is not the difference of its times to the last bit; since J2000 that is 0.1 us.
+    times = seconds + at
+    steps = np.diff(times)
     delta_velocity = (0.5 * (force[1:] + force[:-1]) * steps[:, None]).tolist()
     delta_angle = (0.5 * (rate[1:] + rate[:-1]) * steps[:, None]).tolist()
-    fixes = {
-        int(stamp): _measurement(sidereon, inputs, index, (int(stamp) - begin) / SECOND)
-        for index, stamp in enumerate(inputs.fix_stamp)
-    }
-    engine = _filter(sidereon, kind, start, frame, parameters, holds_gyro_bias)
     states = []
     began = time.process_time()
     try:
         for index, stamp in enumerate(stamps[1:].tolist()):
             step = float(steps[index])
             engine.propagate(
-                sidereon.ImuSample.increment(float(at[index + 1]), delta_velocity[index], delta_angle[index], step)
+                sidereon.ImuSample.increment(float(times[index + 1]), delta_velocity[index], delta_angle[index], step)
             )
-            fix = fixes.get(stamp)
-            if fix is not None:
-                engine.update_loose(fix)
+            update = updates.get(stamp)
+            if update is not None:
+                update()
             states.append(engine.state)
     except ValueError as error:
         raise GaveUpError(str(error)) from error
