@@ -10,8 +10,12 @@ import pytest
 from ruamel.yaml import YAML
 
 from eskf_ros.geodesy.map_frame import MapFrame
+from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.parameters.ros_yaml import load
-from peers import Drive, Ours, inputs_of, run_ours, scored, write_truth
+from eskf_ros.simulate.main import main
+from eskf_ros.simulate.range_receiver import RangeReceiver
+from eskf_ros.simulate.scenario import simulate
+from peers import Drive, Ours, inputs_of, run_ours, run_sidereon, scored, write_truth
 from peers_export import export
 
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -77,3 +81,21 @@ def test_the_judge_finds_what_the_replay_finds(folder: Path, ours: Ours) -> None
     assert float(row[5]) == pytest.approx(3.0, abs=2.0)  # NEES
     if row[7] not in ("-", "evo is not installed"):
         assert float(row[7]) == pytest.approx(rms, rel=0.1)
+
+
+def test_sidereon_gets_the_ranges_that_we_get(tmp_path: Path) -> None:
+    # With another time, another satellite clock or another sign of the Doppler it would be lost within seconds.
+    pytest.importorskip("sidereon")
+    bag = tmp_path / "ranges.mcap"
+    main(["drive", "--imu-rate", "50", "--sensor", "ranges:systems=G", "--out", str(bag), "--quiet"])
+    options = {"imu_rate": 50.0, "ranges": RangeReceiver(systems="G")}
+    parameters = from_mapping({**simulate("drive", 0, **options).parameters(), "mode": "tight"})
+    drive = Drive("ranges", bag, parameters, "truth", ())
+    ours = run_ours(drive)
+    inputs = inputs_of(drive, ours.first_stamp)
+    run = run_sidereon(drive, ours, inputs, MapFrame(ours.datum), holds_gyro_bias=True)
+    both = np.intersect1d(run.rows["stamp"], ours.run.rows["stamp"], return_indices=True)
+    apart = run.rows["position_map"][both[1]] - ours.run.rows["position_map"][both[2]]
+    # The errors of the ranges last: ours and theirs share most of them, 5 m and more vertically.
+    assert np.sqrt(np.mean(np.sum(apart[:, :2] ** 2, axis=1))) < 2.0
+    assert np.sqrt(np.mean(apart[:, 2] ** 2)) < 3.0
