@@ -54,8 +54,10 @@ WORKERS = (1, 2, 4, 8, 16, 32, 64)
 
 @dataclass(frozen=True)
 class Costs:
-    """Seconds: work of each recording; of a worker its start and its first loading of machine code; of the command,
-    what it needs for a recording.
+    """Seconds.
+
+    Work of each recording; of a worker its start and its first loading of machine code; of the command, what it needs
+    for a recording.
     """
 
     work: tuple[float, ...]

@@ -38,8 +38,11 @@ MOVED = 8.0
 
 @dataclass(frozen=True)
 class StaticAxis:
-    """One axis. ``density``: white noise; ``instability``: of the bias; ``walk``: density of its random walk, NaN where
-    the recording is too short for it. ``tau``, ``deviation``: the curve. Units of the readings: m/s2 or rad/s."""
+    """One axis.
+
+    ``density``: white noise; ``instability``: of the bias; ``walk``: density of its random walk, NaN where the
+    recording is too short for it. ``tau``, ``deviation``: the curve. Units of the readings: m/s2 or rad/s.
+    """
 
     name: str
     density: float

@@ -57,8 +57,10 @@ def stamped(drive: list[tuple[int, str, bytes]]) -> Iterator[tuple[int, str, int
 
 @pytest.fixture(scope="module")
 def patient(tmp_path_factory) -> Path:
-    """The configuration with a history that reaches back to the start: however long this machine keeps a process
-    waiting while others pass messages on, all of them are in time."""
+    """The configuration with a history that reaches back to the start.
+
+    However long this machine keeps a process waiting while others pass messages on, all of them are in time.
+    """
     file = tmp_path_factory.mktemp("patient") / "patient.yaml"
     file.write_text(CONFIG.read_text() + "    history: {window: 60.0}\n")
     return file

@@ -1,5 +1,8 @@
-"""Rest that is none, and slow robots: smooth creep, trains, slow turns; tractors, mowers, a turn in place; boats that
-crab; a start in flight. Bars of the issue on trust, on a few seeds."""
+"""Rest that is none, and slow robots.
+
+Smooth creep, trains, slow turns; tractors, mowers, a turn in place; boats that crab; a start in flight. Bars of the
+issue on trust, on a few seeds.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """The linters of ament, which a package of ROS is looked at with; where they are not installed, ruff has to do.
 
-ament_copyright is not among them: it wants the whole header of the licence in each file, and LICENSE covers them all.
+Of ament_copyright only what it says of LICENSE and CONTRIBUTING.md counts: it wants the whole header of the licence in
+each source file, too, and LICENSE covers them all.
 """
 
 from __future__ import annotations
@@ -47,3 +48,10 @@ def test_ament_xmllint() -> None:
     if "failed to load" in result.stdout + result.stderr:
         pytest.skip("needs the network: the schema of package.xml is at download.ros.org")
     assert result.returncode == 0, result.stdout + result.stderr
+
+
+def test_ament_copyright_knows_the_licence() -> None:
+    result = lint("ament_copyright", "--verbose", ".")
+    told = (result.stdout + result.stderr).splitlines()
+    assert "LICENSE: apache2" in told
+    assert "CONTRIBUTING.md: apache2" in told

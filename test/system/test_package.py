@@ -37,7 +37,7 @@ ROS_PACKAGES = {
 # Imported by the tests alone.
 ROS_TEST_PACKAGES = {"rosgraph_msgs", "std_msgs"}
 # Programs of ROS that tests call.
-ROS_TEST_TOOLS = {"ament_flake8", "ament_pep257", "ament_xmllint"}
+ROS_TEST_TOOLS = {"ament_copyright", "ament_flake8", "ament_pep257", "ament_xmllint"}
 ADDRESS = "https://github.com/eskf-ros/eskf_ros"
 # Used where somebody else has installed it.
 OPTIONAL = {"bokeh", "distributed", "evo", "pandas", "robot_localization", "pygeomag"}

@@ -122,7 +122,7 @@ def test_remembered_heading_means_the_same_under_another_datum(parked):
 
 @pytest.mark.parametrize("name", ["gyro_bias", "accel_bias"])
 def test_a_bias_that_the_rest_contradicts_is_dropped(parked, name):
-    """The level is then, to the bit, that of a cold start. (Without fixes: the heading would change what follows.)"""
+    """The level is then, to the bit, that of a cold start (without fixes: the heading would change what follows)."""
     wrong = dataclasses.replace(true_memory(parked), **{name: (0.0, 0.0, 0.5)})
     found, cold, good = (
         run(parked, memory, **{"gnss.use_position": False}).state for memory in (wrong, None, true_memory(parked))

@@ -89,9 +89,9 @@ def is_heading_shown(state):
 
 @njit
 def hold_heading(state, size, work):
-    """Take the heading, the gyro bias about the vertical, whose integral it is, and the offset of a heading sensor,
-    which is known through the heading alone, out of the gain in ``work``.
+    """Take the heading and what is known through it out of the gain in ``work``.
 
+    That is the gyro bias about the vertical, whose integral the heading is, and the offset of a heading sensor.
     GNSS does not see them while no acceleration stands out (`credible_force`) and nothing turns. What the linearised
     filter would learn all the same, it learns from its own corrections: lever arm, Earth rate and biases turn with the
     estimate, and with them what is unobservable. These errors still count in the covariance of the innovation (Schmidt,
