@@ -305,6 +305,7 @@ def blank_state() -> np.ndarray:
     state["stamps"]["even"] = 1.0
     state["quality"]["least_jump"] = np.repeat((LEAST_FORCE_JUMP**2, LEAST_RATE_JUMP**2), 3)
     state["quality"]["lowest"], state["quality"]["highest"] = np.inf, -np.inf
+    state["quality"]["held_value"] = np.inf
     state["attitude"][:, 0] = 1.0
     state["forward"]["transition"], state["forward"]["reset"] = np.eye(ERROR_SIZE), np.eye(3)
     state["forward"]["fade"] = 1.0

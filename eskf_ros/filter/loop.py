@@ -7,7 +7,8 @@ from eskf_ros.filter.alignment.levelling import update_level
 from eskf_ros.filter.fuse import fuse
 from eskf_ros.filter.history.timeline import rewind, save_checkpoint
 from eskf_ros.filter.inertial.navigation_frame import heading_of
-from eskf_ros.filter.inertial.sample_quality import copy_doubt, judge_sample
+from eskf_ros.filter.inertial.sample_doubt import copy_doubt
+from eskf_ros.filter.inertial.sample_quality import judge_sample
 from eskf_ros.filter.inertial.stamps import take_stamp
 from eskf_ros.filter.inertial.strapdown import SMOOTHING_TIME
 from eskf_ros.filter.integrity.imu_monitor import watch_input, watch_interval

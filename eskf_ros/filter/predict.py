@@ -10,7 +10,7 @@ from eskf_ros.filter.inertial.covariance import (
     propagate_covariance,
     propagate_noise,
 )
-from eskf_ros.filter.inertial.sample_quality import shaken_density
+from eskf_ros.filter.inertial.sample_doubt import credible_reading, shaken_density
 from eskf_ros.filter.inertial.strapdown import propagate_nominal_state
 from eskf_ros.filter.output.forward_log import carry_transition
 from eskf_ros.filter.state import augmented_states
@@ -113,6 +113,10 @@ def propagate(state, stamp, sample, instant, settings, work):
     interval = (instant - state.imu.stamp) / SECOND
     force_0, force_1 = line(state.imu.earlier_force, state.imu.force, sample.specific_force, interval, state, settings)
     rate_0, rate_1 = line(state.imu.earlier_rate, state.imu.rate, sample.angular_rate, interval, state, settings)
+    force_0 = credible_reading(state.quality, force_0, 0, 0.0)
+    force_1 = credible_reading(state.quality, force_1, 0, 1.0)
+    rate_0 = credible_reading(state.quality, rate_0, 3, 0.0)
+    rate_1 = credible_reading(state.quality, rate_1, 3, 1.0)
     gap = interval if interval > settings.imu_gap else 0.0
     steps = (stamp - state.stamp + LONGEST_STEP - 1) // LONGEST_STEP
     begin = (state.stamp - state.imu.stamp) / SECOND / interval
@@ -126,8 +130,8 @@ def propagate(state, stamp, sample, instant, settings, work):
         step(state, force_a, rate_a, force_b, rate_b, (end - begin) * interval / steps, gap, settings, work)
         force_a = force_b
         rate_a = rate_b
-    force = between(state.imu.force, sample.specific_force, end)
-    rate = between(state.imu.rate, sample.angular_rate, end)
+    force = credible_reading(state.quality, between(state.imu.force, sample.specific_force, end), 0, end)
+    rate = credible_reading(state.quality, between(state.imu.rate, sample.angular_rate, end), 3, end)
     for i in range(3):
         state.specific_force[i] = force[i]
         state.angular_rate[i] = rate[i]

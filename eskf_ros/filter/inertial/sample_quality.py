@@ -3,14 +3,15 @@
 A sensor that measures is noisy: no six axes stay on a straight line, and no axis keeps a value to the last bit for
 long, unless its resolution is so coarse that this is usual for it, which is learnt. What is out of the ordinary tells
 that motion is not measured; the rate or force is then in error by an unknown constant, and the variance of velocity or
-attitude along that axis grows with the square of the time, over exactly that time:
+attitude along that axis grows with the square of the time, over exactly that time (`sample_doubt`):
 
 - All axes on a line for longer than ``imu.gap``: a hole that a driver has filled. It costs what a hole costs.
-- One axis that keeps a value: clipped if the value is the largest or smallest ever read, else stuck.
+- One axis that keeps a value or comes back to the end of its range: stuck or clipped (`held_axes`).
 - A jump from one sample to the next, away from the mean of late, that is far beyond all changes before: a shock that
-  the sensor may not follow.
+  the sensor may not follow, or the body.
 
-While the robot seems to stand nothing is widened: there a reading may well stay the same.
+While the robot seems to stand nothing is widened but what shows that it does not: there a reading may well stay the
+same.
 """
 
 from __future__ import annotations
@@ -20,6 +21,15 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.inertial.held_axes import (
+    FEWEST_EQUAL,
+    FIRST_SAMPLES,
+    is_end_of_range,
+    is_standing,
+    is_usual,
+    watch_axis,
+)
+from eskf_ros.filter.inertial.sample_doubt import clear_doubt, widen
 from eskf_ros.filter.state.time import NEVER
 
 SAMPLE_QUALITY = np.dtype(
@@ -47,13 +57,17 @@ SAMPLE_QUALITY = np.dtype(
         ("shock_level", "f8", (6,)),
         ("is_doubted", "i8"),
         ("doubt", "f8", (6,)),
+        ("error", "f8", (6,)),
+        ("excess", "f8", (2, 6)),
+        ("hidden", "f8", (6,)),
+        ("hidden_stamp", "i8", (6,)),
         ("repeated", "i8"),
         ("bridged", "i8"),
         ("hole_time", "f8"),
         ("clipped_time", "f8", (6,)),
-        ("clipped_value", "f8", (6,)),
         ("stuck_time", "f8", (6,)),
-        ("stuck_value", "f8", (6,)),
+        ("held_value", "f8", (6,)),
+        ("held_stamp", "i8", (6,)),
     ],
     align=True,
 )
@@ -69,9 +83,13 @@ SAMPLE_QUALITY = np.dtype(
 - ``shock_axis``, ``shock_size``, ``shock_time``: which axis jumped by how much (0: no shock), and since when (s);
   ``shock_level``: all readings before.
 - ``doubt``: variance per second of velocity (m2/s3) and attitude (rad2/s) along the axes over the interval that the
-  newest sample ends; ``is_doubted``: whether one is above zero.
-- ``repeated``, ``bridged``: holes filled in either way; ``hole_time``: their length together (s). ``clipped_*``,
-  ``stuck_*``: for how long an axis was so, together (s), and its value then.
+  newest sample ends; ``is_doubted``: whether one is above zero. ``error``: standard deviations of the readings (m/s2,
+  rad/s); ``excess``: what is taken off them at the begin and the end of the interval.
+- ``hidden``, ``hidden_stamp``: what clipped readings have hidden of velocity (m/s) and attitude (rad) of late, and when
+  the last of them was (ns).
+- ``repeated``, ``bridged``: holes filled in either way; ``hole_time``: their length together (s). ``clipped_time``,
+  ``stuck_time``: for how long an axis was so, together (s); ``held_value``, ``held_stamp``: the value that it kept
+  then, and the last time (ns).
 """
 
 MEMORY = 4096
@@ -83,9 +101,6 @@ LEARNING = 1.0 / 256.0
 OUTLIER = 64.0
 """Ratio of the square of a change to its mean up to which it is learnt, and above which it is a jump."""
 
-FIRST_SAMPLES = 256
-"""Samples that are learnt from before one is judged."""
-
 ON_LINE = 1e-6
 """Ratio of the square of a second difference to its mean below which three samples are on a straight line."""
 
@@ -96,9 +111,6 @@ simulation without noise has straight lines that say nothing."""
 FEWEST_NOISY = 2
 """Axes, at least, that must be noisy for lines to mean anything."""
 
-USUAL_EQUAL = 0.5
-"""Share of readings that an axis repeats from which on nothing is concluded from that."""
-
 USUAL_LINES = 0.1
 """Share of samples on a line in all axes from which on nothing is concluded from that: so coarse a sensor stays there
 the longer the slower it moves.
@@ -106,24 +118,6 @@ the longer the slower it moves.
 
 LEAST_SHARE = 1e-3
 """Smallest share of equal readings that is assumed: fewer than that cannot be told from none."""
-
-CHANCE = -20.0
-"""Logarithm of the probability below which a run of equal readings is no chance: one in 5e8 samples."""
-
-FEWEST_EQUAL = 3
-"""Repetitions of a reading from which on an axis is looked at."""
-
-STUCK_AFTER = 0.5
-"""s; an axis within its range is stuck when it keeps a value for longer."""
-
-LASTS = 2.0
-"""s; for so long the motion that an axis does not measure stays the same, about."""
-
-STANDING = 0.3
-"""m/s; at a smaller estimated speed the robot may stand, and a reading may stay the same."""
-
-SEEN_LATELY = 3_000_000_000
-"""ns; for so long a robot that another sensor has seen moving is thought to move."""
 
 LEAST_FORCE_JUMP = 10.0
 """m/s2; a smaller change from one sample to the next is no shock."""
@@ -134,28 +128,11 @@ LEAST_RATE_JUMP = 1.0
 SHOCK_ENDS = 0.5
 """Share of the jump: a reading closer to that before the jump ends the shock."""
 
+HALF = 0.5
+"""Share of a blow that is taken for motion. Whether the body moved as is read or not at all, it is one sigma away."""
+
 LONGEST_SHOCK = 0.5
 """s; after that the reading is believed again."""
-
-
-@njit
-def copy_doubt(state, lane):
-    """Let another lane know which axes of the interval are doubted, and how much readings change."""
-    lane.quality.is_doubted = state.quality.is_doubted
-    for i in range(6):
-        lane.quality.doubt[i] = state.quality.doubt[i]
-        lane.quality.change[i] = state.quality.change[i]
-
-
-@njit
-def shaken_density(quality, first, interval):
-    """Return the density of white noise by which the readings of a sensor would change as much as they do.
-
-    Vibration is no noise of the sensor, but says as little of the motion. ``first``: 0 for the accelerometers
-    (m/s2/rtHz), 3 for the gyros (rad/s/rtHz); ``interval`` of the samples in s.
-    """
-    largest = max(quality.change[first], max(quality.change[first + 1], quality.change[first + 2]))
-    return math.sqrt(0.5 * largest * interval)
 
 
 @njit
@@ -172,7 +149,7 @@ def judge_sample(state, sample, instant, settings):
     quality.count += 1
     # How usual repetitions are is not learnt from those that are out of the ordinary.
     weight = 0.0 if quality.is_doubted == 1 else 1.0 / min(quality.count, MEMORY)
-    equal, on_line, noisy, jumps = 0, 0, 0, 0
+    equal, on_line, noisy, jumps, ends = 0, 0, 0, 0, 0
     for i in range(6):
         change, bend = differences(state, sample, i, ratio)
         is_equal = change == 0.0
@@ -182,12 +159,10 @@ def judge_sample(state, sample, instant, settings):
         jump = jump_of(state, sample, i)
         jumps += jump * jump > max(quality.least_jump[i], OUTLIER * quality.change[i])
         learn(quality, i, read(sample, i), change, bend, is_equal, weight)
+        ends += is_end_of_range(quality, i, read(sample, i))
     if equal > 0 or quality.any_equal == 1:
         count_equal(state, quality, sample, interval)
-    if quality.is_doubted == 1:
-        for i in range(6):
-            quality.doubt[i] = 0.0
-        quality.is_doubted = 0
+    clear_doubt(quality)
     is_line = on_line == 6
     if quality.shock_size > 0.0 or (jumps > 0 and quality.count > FIRST_SAMPLES):
         watch_shock(state, quality, sample, interval)
@@ -200,10 +175,11 @@ def judge_sample(state, sample, instant, settings):
         quality.line_count = quality.line_equal = 0
         quality.line_time = quality.line_paid = 0.0
     quality.line_share = max(quality.line_share + weight * (is_line - quality.line_share), LEAST_SHARE)
-    if equal > 0 and not is_line:
+    if (equal > 0 or ends > 0) and not is_line:
         for i in range(6):
-            if quality.equal_count[i] >= FEWEST_EQUAL:
-                watch_axis(state, quality, i, interval, settings)
+            reading = read(sample, i)
+            if quality.equal_count[i] >= FEWEST_EQUAL or is_end_of_range(quality, i, reading):
+                watch_axis(state, quality, i, reading, instant, interval, settings)
 
 
 @njit
@@ -300,8 +276,10 @@ def watch_shock(state, quality, sample, interval):
     quality.shock_time = begin + interval
     for i in range(6):
         level = quality.shock_level[i]
-        departure = max(abs(read(sample, i) - level), abs(last_reading(state, i) - level))
-        widen(quality, i, departure, begin, quality.shock_time, interval)
+        quality.excess[0, i] = HALF * (last_reading(state, i) - level)
+        quality.excess[1, i] = HALF * (read(sample, i) - level)
+        std = max(abs(quality.excess[0, i]), abs(quality.excess[1, i]))
+        widen(quality, i, std, begin, quality.shock_time, interval)
     departure = abs(read(sample, quality.shock_axis) - quality.shock_level[quality.shock_axis])
     if departure < SHOCK_ENDS * quality.shock_size or quality.shock_time > LONGEST_SHOCK:
         quality.shock_size = 0.0
@@ -327,64 +305,6 @@ def watch_line(state, quality, interval, settings):
         std = settings.gap_accel_std if i < 3 else settings.gap_gyro_std
         widen(quality, i, std, quality.line_paid, quality.line_time, interval)
     quality.line_paid = quality.line_time
-
-
-@njit
-def watch_axis(state, quality, i, interval, settings):
-    """Widen one axis that keeps its value beyond all chance while others move."""
-    value = last_reading(state, i)
-    is_clipped = value <= quality.lowest[i] or value >= quality.highest[i]
-    # What is stuck a second time at the same size is clipped, although more has been read before.
-    again = quality.equal_paid[i] == 0.0 and quality.stuck_time[i] > 0.0
-    if (again or quality.clipped_time[i] > 0.0) and abs(value) == abs(quality.stuck_value[i]):
-        is_clipped = True
-        quality.clipped_time[i] += quality.stuck_time[i]
-        quality.stuck_time[i] = 0.0
-    if not is_clipped and quality.equal_time[i] < STUCK_AFTER:
-        return
-    if is_usual(quality, quality.equal_share[i], USUAL_EQUAL, quality.equal_count[i]) or is_standing(state):
-        return
-    begin, end = quality.equal_paid[i], quality.equal_time[i]
-    if is_clipped:
-        # The truth may be anywhere beyond.
-        bias = state.accel_bias[i] if i < 3 else state.gyro_bias[i - 3]
-        std = abs(value - bias)
-        quality.clipped_time[i] += end - begin
-        quality.clipped_value[i] = value
-    else:
-        std = settings.gap_accel_std if i < 3 else settings.gap_gyro_std
-        quality.stuck_time[i] += end - begin
-        quality.stuck_value[i] = value
-    widen(quality, i, std, begin, end, interval)
-    quality.equal_paid[i] = end
-
-
-@njit
-def is_usual(quality, share, usual, count):
-    """Say whether a run of ``count`` equal readings may be chance, or is the way of a sensor that repeats often."""
-    if quality.count < FIRST_SAMPLES or share > usual:
-        return True
-    return count * math.log(share) > CHANCE
-
-
-@njit
-def is_standing(state):
-    """Say whether the robot is estimated to stand, or has not been seen to move while its heading is unknown."""
-    if state.heading_known == 0:
-        return state.window.motion_stamp == NEVER or state.stamp - state.window.motion_stamp > SEEN_LATELY
-    v = state.velocity_map
-    return v[0] * v[0] + v[1] * v[1] + v[2] * v[2] < STANDING * STANDING
-
-
-@njit
-def widen(quality, i, std, begin, end, interval):
-    """Let axis ``i`` be in error by a constant of ``std`` from ``begin`` to ``end`` (s), paid over ``interval`` s.
-
-    What is in error for longer than `LASTS` is in error by something else by then.
-    """
-    growth = (end - begin) * min(end + begin, 2.0 * LASTS)
-    quality.doubt[i] += std * std * growth / interval
-    quality.is_doubted = 1
 
 
 @njit

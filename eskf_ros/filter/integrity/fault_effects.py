@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.inertial.sample_quality import shaken_density
+from eskf_ros.filter.inertial.sample_doubt import shaken_density
 from eskf_ros.filter.inertial.strapdown import SMOOTHING_TIME, gravity_map
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, SOURCES, VELOCITY

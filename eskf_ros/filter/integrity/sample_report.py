@@ -53,10 +53,10 @@ def axis_complaints(state: np.void) -> list[str]:
             value = float((quality["lowest"] if ends[0] > ends[1] else quality["highest"])[i])
             found.append(f"the {axis} is clipped at {value:.2f} {unit} ({ends.max()} samples): set a larger range")
         elif clipped > LEAST_TIME and clipped >= stuck:
-            value = float(quality["clipped_value"][i])
+            value = float(quality["held_value"][i])
             found.append(f"the {axis} is clipped at {value:.2f} {unit} ({clipped:.1f} s in all): set a larger range")
         elif stuck > LEAST_STUCK:
-            value = float(quality["stuck_value"][i])
+            value = float(quality["held_value"][i])
             found.append(
                 f"the {axis} was stuck at {value:.3f} {unit} for {stuck:.1f} s while the other axes moved: look at the "
                 "sensor and its driver"

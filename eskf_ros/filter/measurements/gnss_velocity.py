@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.inertial.navigation_frame import body_rate, local_east_north_up_to_ecef
+from eskf_ros.filter.inertial.sample_doubt import shaken_velocity
 from eskf_ros.filter.measurements.antenna import antenna_velocity, carry_velocity, lever_arm_of, set_lever_arm
 from eskf_ros.filter.measurements.jacobians import (
     clear,
@@ -37,6 +38,14 @@ from eskf_ros.filter.state.error_state import ATTITUDE, GYRO_BIAS, VELOCITY
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix
 
 SIZE = 3
+
+LEAST_SHAKEN = 0.02
+"""m/s; vibration that moves the velocity to and fro by less is within what receivers claim."""
+
+SWING = 2.0
+"""Noise of a velocity over its swing by vibration (standard deviations): it turns with the heading, and must not be
+thought to show it.
+"""
 
 
 NOTABLE_SCATTER = 2.0
@@ -93,6 +102,7 @@ def linearize_antenna(state, measured, source, settings, work):
         for j in range(3):
             work.noise[i, j] -= rate_variance * lever[i] * lever[j]
         work.noise[i, i] += rate_variance * dot(lever, lever)
+    add_unmeasured_motion(state, rotation, arm, work)
     if state.heading_known == 0:
         for i in range(3):
             work.noise[i, i] += dot(lever_velocity, lever_velocity)
@@ -112,6 +122,27 @@ def linearize_antenna(state, measured, source, settings, work):
             work.jacobian[i, GYRO_BIAS + j] = row[j]
     set_lever_arm(work.jacobian, state, rotation, source, True, settings)
     carry_velocity(state, rotation, source, settings, work)
+
+
+@njit
+def add_unmeasured_motion(state, rotation, arm, work):
+    """Add to the noise what vibration makes of the predicted velocity, and the rates that the gyro does not measure.
+
+    The latter move the antenna at ``arm`` (m, IMU axes); ``rotation``: body to map.
+    """
+    shaken = shaken_velocity(state.quality, state.imu.interval)
+    if shaken > LEAST_SHAKEN:
+        for i in range(3):
+            work.noise[i, i] += (SWING * shaken) ** 2
+    if state.quality.is_doubted == 0:
+        return
+    for k in range(3):
+        axis = (1.0 if k == 0 else 0.0, 1.0 if k == 1 else 0.0, 1.0 if k == 2 else 0.0)
+        moved = rotate(rotation, cross(axis, arm))
+        variance = state.quality.error[3 + k] ** 2
+        for i in range(3):
+            for j in range(3):
+                work.noise[i, j] += variance * moved[i] * moved[j]
 
 
 def read(messages: npt.NDArray[Any]) -> Readings:
