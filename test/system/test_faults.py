@@ -128,14 +128,6 @@ def test_a_multirotor_that_flies_sideways_is_not_said_to_be_mounted_wrong() -> N
     assert run_named("clean: long_flight", DEFAULT_VELOCITY).said == {}
 
 
-def test_velocities_in_other_axes_are_named_within_ten_seconds_of_motion() -> None:
-    """They lead the filter away by twice the speed: each second counts."""
-    name = "velocity in north, east, down"
-    trace = run_named(name, TOLD_VELOCITY)
-    moving = trace.seconds[np.argmax(trace.speed > 3.0)]
-    assert figures_of(BY_NAME[name], trace).named_after < moving + 10.0 + 5.0 - BY_NAME[name].begin
-
-
 @pytest.mark.parametrize(
     ("name", "given", "parameter"),
     [

@@ -1,4 +1,4 @@
-"""Two lanes: when the humble one takes over, what the filter keeps, and what is published while fixes are refused."""
+"""Two lanes and the motion: when the humble lane takes over, what the filter keeps, and what jumps and axes say."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from eskf_ros.filter.history.records import AID
 from eskf_ros.filter.integrity.humble_lane import EVIDENCE, reset_to_humble_lane, weigh_evidence
-from eskf_ros.filter.integrity.motion_monitor import offset_by_jumps
+from eskf_ros.filter.integrity.motion_monitor import compare_axes, offset_by_jumps
 from eskf_ros.filter.integrity.refusal import FEWEST, rival_offset
 from eskf_ros.filter.layout import blank_state
 from eskf_ros.filter.state.enums import Stream
@@ -114,3 +114,19 @@ def test_after_a_jump_the_estimate_is_off_by_as_much_as_it_has_followed() -> Non
     state["motion"]["offset"] = (0.0, 0.0)
     refused(state, 2.0, (-15.0, 0.0))
     assert offset_by_jumps(state) == (15.0, 0.0)
+
+
+def test_velocities_in_other_axes_are_found_by_four_windows_in_motion() -> None:
+    """However long the robot stood before; ways that agree say that they are not."""
+    state = lanes(0.0)[0]
+    for exchanged in (True, False):
+        motion = state["motion"]
+        motion["axes"] = 0.0
+        for _ in range(50):
+            motion["start_way"] = (0.1, -0.2)
+            compare_axes(motion, (0.4, 0.3))
+        for window in range(4):
+            assert motion["has_other_axes"] == 0, window
+            motion["start_way"] = (18.0, 5.0) if exchanged else (5.0, 18.0)
+            compare_axes(motion, (5.5, 17.5))
+        assert motion["has_other_axes"] == int(exchanged)

@@ -56,13 +56,22 @@ def write_effect(state, aid, work, settings):
 
 @njit
 def write_effect_on_position(state, source, effect, settings):
-    """Write the derivative of a position by the faults of its receiver to the first rows of ``effect``."""
+    """Write the derivative of a position by the faults of its receiver to the first rows of ``effect``.
+
+    A velocity that is not larger than its own uncertainty says nothing of the time: at rest it is what the errors of
+    the fixes have made of it, and would explain them.
+    """
     rotation = to_matrix(state.attitude)
+    velocity, unknown = state.velocity_map, 0.0
+    for i in range(3):
+        unknown += state.covariance[VELOCITY + i, VELOCITY + i]
+    square = velocity[0] * velocity[0] + velocity[1] * velocity[1] + velocity[2] * velocity[2]
+    share = certain_share(square, unknown)
     turning = rotate(rotation, cross(smoothed_rate(state, rotation), settings.lever_arms_body[source]))
     for i in range(3):
         for k in range(3):
             effect[i, k] = rotation[i][k]
-        effect[i, POSITION_TIME] = state.velocity_map[i] + turning[i]
+        effect[i, POSITION_TIME] = share * velocity[i] + turning[i]
 
 
 @njit

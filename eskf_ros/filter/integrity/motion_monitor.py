@@ -5,6 +5,8 @@ course and accelerations, the IMU alone turns and specific force; both over wind
 negated or swapped, a mounting that is turned, and a gyro with a wrong scale show, whatever the filter believes; and so
 does a receiver that contradicts itself: velocities in other axes than positions, fixes that jump, stamps that run ahead
 of the motion. `motion_report` draws the conclusions.
+
+Over 400 lines: one record, whose windows begin and end together, and a third of the lines says what its fields are.
 """
 
 from __future__ import annotations

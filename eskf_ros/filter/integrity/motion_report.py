@@ -10,7 +10,7 @@ import numpy as np
 from eskf_ros.filter.integrity.heading_monitor import slip_of
 from eskf_ros.filter.integrity.motion_sums import FEWEST_TURNS, SAME, TURNED
 from eskf_ros.filter.state.enums import Stream
-from eskf_ros.filter.state.time import SECOND
+from eskf_ros.filter.state.time import NEVER, SECOND
 
 LONGEST_COMPARISON = 180 * SECOND
 """ns; after this time without turns or accelerations nothing is waited for."""
@@ -136,7 +136,7 @@ def travel_complaints(state: np.void, settings: np.void, mount_rpy_deg: Sequence
     if compared is not None:
         matrix, std = compared
         yaw, what = -math.atan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1]), "accelerations"
-    elif slip is not None:
+    elif slip is not None and state["motion"]["heard_stamp"] == NEVER:
         (yaw, std), what = (-slip[0], slip[1]), "velocity"
     else:
         return [], False

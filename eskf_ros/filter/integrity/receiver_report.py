@@ -24,7 +24,7 @@ from eskf_ros.filter.state.error_state import SOURCES
 SCATTERED_VELOCITY = 3.0
 """Mean square of the velocities about the humble lane, over their variance, from which on they claim too much."""
 
-DOUBTFUL_SIGMAS = 15.0
+DOUBTFUL_SIGMAS = 10.0
 """Standard deviations beyond which a fault of the installation is reported although IMU or fixes are at fault, too."""
 
 VERTICAL_SIGMAS = 30.0
@@ -70,7 +70,7 @@ def aid_complaints(state: np.void, settings: np.void, is_explained: bool, is_imu
         lies = _covariance_complaints(state, source, scale, _may_be_late(state, source))
         # Fixes that scatter seem to jump.
         paths = [] if lies else _path_complaints(state, source)
-        is_doubtful = is_imu_doubtful or bool(paths) or _has_calm_errors(state, source) or _departures(state, source) >= FEW_DEPARTURES
+        is_doubtful = is_imu_doubtful or bool(paths) or _departures(state, source) >= FEW_DEPARTURES
         faults = _fault_complaints(state, settings, source, is_doubtful)
         # Those faults explain drifts, contradictions and a high NIS: no sentences of their own.
         found += paths + faults + lies
@@ -92,7 +92,8 @@ def _of(source: int) -> str:
     return "" if source == 0 else " of the second receiver"
 
 
-def _fault_complaints(state: np.void, settings: np.void, source: int, is_doubtful: bool) -> list[str]:
+def _certain_faults(state: np.void, settings: np.void, source: int, is_doubtful: bool) -> np.ndarray:
+    """Return the faults of the installation that are worth a sentence, the others zero."""
     found, sigma = state["installation"]["found"][source].copy(), state["installation"]["sigma"][source]
     found[state["installation"]["held"][source] < LASTING_LOOKS] = 0.0
     vertical = int(np.argmax(np.abs(settings["imu_to_base"][2])))
@@ -101,8 +102,17 @@ def _fault_complaints(state: np.void, settings: np.void, source: int, is_doubtfu
     for time in (POSITION_TIME, VELOCITY_TIME):
         if sigma[time] > LARGEST_TIME_STD:
             found[time] = 0.0
+    is_uncertain = np.abs(found) < DOUBTFUL_SIGMAS * sigma
     if is_doubtful:
-        found[np.abs(found) < DOUBTFUL_SIGMAS * sigma] = 0.0
+        found[is_uncertain] = 0.0
+    if is_uncertain[VELOCITY_TIME] and _has_calm_errors(state, source):
+        # The velocity of the estimate follows the errors of the fixes, and is late or early with them.
+        found[VELOCITY_TIME] = 0.0
+    return np.asarray(found)
+
+
+def _fault_complaints(state: np.void, settings: np.void, source: int, is_doubtful: bool) -> list[str]:
+    found, sigma = _certain_faults(state, settings, source, is_doubtful), state["installation"]["sigma"][source]
     group = "gnss" if source == 0 else "second_gnss"
     clock = "ranges" if source == 0 and settings["solves_ranges"] else group
     texts = []
@@ -239,16 +249,15 @@ def _departures(state: np.void, source: int) -> int:
 
 def _departure_complaints(state: np.void, source: int) -> list[str]:
     """Return a sentence if a receiver drifted off the path of the IMU, or the humble lane had to take over."""
-    departures, stamp = _departures(state, source), int(state["receiver"]["departure_stamp"][source])
-    takeovers = int(state["trust"]["takeovers"]) if source == 0 else 0
+    departures, takeovers = _departures(state, source), int(state["trust"]["takeovers"]) if source == 0 else 0
     if source == 0 and given_heading_complaints(state):
         takeovers -= int(state["heading_monitor"]["explained"][0])
     is_early = int(state["stamp"]) - int(state["first_stamp"]) < LONGEST_COMPARISON
     may_be_late = is_early and float(state["installation"]["sigma"][source, POSITION_TIME]) > CERTAIN_TIME_STD
     if departures < FEW_DEPARTURES and (may_be_late or not takeovers):
         return []
-    if not departures:
-        stamp = int(state["trust"]["doubt_stamp"])
+    departed, doubted = int(state["receiver"]["departure_stamp"][source]), int(state["trust"]["doubt_stamp"])
+    stamp = min([departed] * bool(departures) + [doubted] * bool(takeovers))
     of_stamps = "; or the stamps of the IMU, which jitter, are why" if stamp_complaints(state) else ""
     return [
         f"the receiver{_of(source)} and the IMU went different ways {departures + takeovers} times, once at the stamp "
