@@ -121,7 +121,7 @@ def test_velocities_in_other_axes_are_found_by_four_windows_in_motion() -> None:
     state = lanes(0.0)[0]
     for exchanged in (True, False):
         motion = state["motion"]
-        motion["axes"] = 0.0
+        motion["axes"], motion["has_other_axes"] = 0.0, 0
         for _ in range(50):
             motion["start_way"] = (0.1, -0.2)
             compare_axes(motion, (0.4, 0.3))
