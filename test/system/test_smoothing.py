@@ -193,7 +193,7 @@ def test_drive_0708_inside_outages(
     assert row.smoother[1] <= most
 
 
-THREE_OUTAGES = pytest.mark.xfail(reason="0.90 m, by the outages from 510, 810 and 1500 s; the cause is open")
+THREE_OUTAGES = pytest.mark.xfail(reason="0.91 m: no fix beside the outages from 510, 810 and 1500 s is right")
 
 TOKYO_NHC = (NHC, *REAR_AXLE)
 
