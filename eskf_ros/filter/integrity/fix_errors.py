@@ -64,7 +64,7 @@ def update_shares(state, lane, source, settings, work):
         interval = max(1e-9 * state.recovery.absolute_interval, LEAST_INTERVAL)
         # A Gauss-Markov error of variance v walks by 2 v / time in a second.
         steps = 1.0 / (settings.optional_decay[settings.position_error_at - ERROR_SIZE] * interval)
-        calm = min(0.5 * scatter.walk[source] * steps, LARGEST_SPREAD)
+        calm = max(calm, min(0.5 * scatter.walk[source] * steps, LARGEST_SPREAD))
     update_lasting_share(state, lane, source, used, calm, settings, work)
     scatter.calm[source] = calm if scatter.lasting[source] == 0.0 else 0.0
 

@@ -81,6 +81,9 @@ SLIP_STD = math.radians(1.0)
 FEWEST_SLIPS = 30
 """Directions of travel from which on they are judged."""
 
+LARGEST_CALM = 0.6
+"""Share of the claims of the fixes that may last."""
+
 LARGEST_SPREAD = math.radians(5.0)
 """rad; standard deviation of the directions of travel of a robot that is made to travel in one."""
 
@@ -208,7 +211,8 @@ def slip_of(state: np.void) -> tuple[float, float] | None:
     None where it is not known, or changes: not every robot is made to travel in one direction.
     """
     weight, total, square, count = (float(value) for value in state["heading_monitor"]["slip"])
-    if count < FEWEST_SLIPS or not state["heading_known"]:
+    # Errors of fixes that last turn the velocity of the estimate, and its heading.
+    if count < FEWEST_SLIPS or not state["heading_known"] or state["scatter"]["calm"][0] > LARGEST_CALM:
         return None
     mean = total / weight
     if square / weight - mean * mean > LARGEST_SPREAD**2:

@@ -103,6 +103,9 @@ LOST_HEADING_STD = 0.5
 BIAS_GATE = 11.34
 """NIS of three biases of the filter in the humble lane beyond which they are wrong: the chi-square quantile of 0.99."""
 
+BELIEVED = 16.0
+"""Factor on the variances of the biases that the filter keeps: the IMU may be four times as noisy as was believed."""
+
 DRIFT = 1.5
 """Standard deviations (`heading_corrections.one_way`) of the heading from which on the biases are doubted."""
 
@@ -375,6 +378,6 @@ def keep_bias(state, first, bias, variance, work):
         now = state.accel_bias[i] if first == ACCEL_BIAS else state.gyro_bias[i]
         work.innovation[i] = bias[i] - now
         work.jacobian[i, first + i] = 1.0
-        work.noise[i, i] = variance[i]
+        work.noise[i, i] = BELIEVED * variance[i]
     verdict, _ = update(state, 3, BIAS_GATE, work)
     return verdict == Verdict.FUSED

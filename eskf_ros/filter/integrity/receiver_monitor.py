@@ -57,8 +57,8 @@ DRIFT_ALLOWANCE = 0.5
 DRIFT_LIMIT = 16.0
 """CUSUM threshold (sigma): white innovations reach it by chance about once in hundreds of hours."""
 
-FEW_DEPARTURES = 3
-"""A drift is reported from this many threshold crossings on: correlated errors of fixes may cause fewer."""
+FEW_DEPARTURES = 2
+"""A drift is reported from this many threshold crossings on: an error of fixes that lasts may cause one."""
 
 LONG_COAST = 5_000_000_000
 """ns; shorter outages are not judged."""
@@ -93,8 +93,9 @@ def watch_receiver(state, aid, work, settings):
     elif aid.stream == Stream.GNSS_VELOCITY:
         watch_velocity(state, aid)
     is_alone = aid.stream == Stream.GNSS_POSITION and not is_live(state, Stream.GNSS_VELOCITY.value, aid.source)
-    # Of a filter that has just been replaced the innovation says nothing.
-    if (aid.stream == Stream.GNSS_VELOCITY or is_alone) and aid.verdict != Verdict.TAKEOVER:
+    # Of a filter that has just been replaced the innovation says nothing, and a fault that is certain explains it.
+    is_telling = aid.verdict != Verdict.TAKEOVER and not has_found_fault(state, aid.source)
+    if (aid.stream == Stream.GNSS_VELOCITY or is_alone) and is_telling:
         watch_departure(state, aid.source, work)
     if aid.stream == Stream.GNSS_POSITION:
         watch_heading_std(state, settings)
@@ -122,6 +123,15 @@ def watch_velocity(state, aid):
     sums = state.receiver.velocity_nis[aid.source]
     sums[0] += NIS_GAIN * (nis - sums[0])
     sums[1] += 1.0
+
+
+@njit
+def has_found_fault(state, source):
+    """Say whether a fault of the installation is certain at present."""
+    for found in state.installation.found[source]:
+        if found != 0.0:
+            return True
+    return False
 
 
 @njit

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from scipy.special import chdtri
 
-from eskf_ros.filter.integrity.fault_effects import GYRO_DRIFT, GYRO_SCALE, POSITION_TIME, VELOCITY_TIME
+from eskf_ros.filter.integrity.fault_effects import FAULTS, GYRO_DRIFT, GYRO_SCALE, POSITION_TIME, VELOCITY_TIME
 from eskf_ros.filter.integrity.heading_monitor import given_heading_complaints
-from eskf_ros.filter.integrity.installation_monitor import LASTING_LOOKS, TIME_ERROR
+from eskf_ros.filter.integrity.installation_monitor import FAULT_PRIOR, LASTING_LOOKS, TIME_ERROR
 from eskf_ros.filter.integrity.motion_report import LONGEST_COMPARISON, has_compared
 from eskf_ros.filter.integrity.receiver_monitor import (
     FEW_DEPARTURES,
@@ -24,8 +24,14 @@ from eskf_ros.filter.state.error_state import SOURCES
 SCATTERED_VELOCITY = 3.0
 """Mean square of the velocities about the humble lane, over their variance, from which on they claim too much."""
 
-DOUBTFUL_SIGMAS = 10.0
+DOUBTFUL_SIGMAS = 15.0
 """Standard deviations beyond which a fault of the installation is reported although IMU or fixes are at fault, too."""
+
+IMPLAUSIBLE, IMPLAUSIBLE_SIGMAS = 2.0, 7.0
+"""Prior and present standard deviations beyond which a fault of the installation is none, however certain it seems."""
+
+MANY_DEPARTURES = 3
+"""Drifts off the path of the IMU from which on they may be why a fault of the installation seems certain."""
 
 VERTICAL_SIGMAS = 30.0
 """The same for a vertical lever arm: it shows by roll and pitch alone, and many other errors go with those."""
@@ -70,12 +76,12 @@ def aid_complaints(state: np.void, settings: np.void, is_explained: bool, is_imu
         lies = _covariance_complaints(state, source, scale, _may_be_late(state, source))
         # Fixes that scatter seem to jump.
         paths = [] if lies else _path_complaints(state, source)
-        is_doubtful = is_imu_doubtful or bool(paths) or _departures(state, source) >= FEW_DEPARTURES
+        is_doubtful = is_imu_doubtful or bool(paths) or _departures(state, source) >= MANY_DEPARTURES
         faults = _fault_complaints(state, settings, source, is_doubtful)
         # Those faults explain drifts, contradictions and a high NIS: no sentences of their own.
         found += paths + faults + lies
         # One that is not certain for long may do so, too; or axes of the IMU, which take their time.
-        is_open = bool(state["installation"]["found"][source].any())
+        is_open = bool(state["installation"]["found"][source].any()) and not _is_implausible(state, source)
         if is_certain and not is_open and not paths and not faults and not lies:
             found += _velocity_complaints(state, source) + _departure_complaints(state, source)
     if state["recovery"]["resets"]:
@@ -92,8 +98,16 @@ def _of(source: int) -> str:
     return "" if source == 0 else " of the second receiver"
 
 
+def _is_implausible(state: np.void, source: int) -> bool:
+    """Say whether a fault seems certain that no installation has: something else is wrong, and looks like several."""
+    estimate, sigma = (np.abs(state["installation"][name][source]) for name in ("estimate", "sigma"))
+    return bool(np.any((estimate > IMPLAUSIBLE * np.array(FAULT_PRIOR)) & (estimate > IMPLAUSIBLE_SIGMAS * sigma)))
+
+
 def _certain_faults(state: np.void, settings: np.void, source: int, is_doubtful: bool) -> np.ndarray:
     """Return the faults of the installation that are worth a sentence, the others zero."""
+    if _is_implausible(state, source):
+        return np.zeros(FAULTS)
     found, sigma = state["installation"]["found"][source].copy(), state["installation"]["sigma"][source]
     found[state["installation"]["held"][source] < LASTING_LOOKS] = 0.0
     vertical = int(np.argmax(np.abs(settings["imu_to_base"][2])))
