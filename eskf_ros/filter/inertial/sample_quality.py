@@ -129,7 +129,10 @@ SHOCK_ENDS = 0.5
 """Share of the jump: a reading closer to that before the jump ends the shock."""
 
 HALF = 0.5
-"""Share of a blow that is taken for motion. Whether the body moved as is read or not at all, it is one sigma away."""
+"""Share of a hard blow that is taken for motion: whether the body moved as is read or not at all is one sigma away."""
+
+HARD_FORCE, HARD_RATE = 40.0, 3.5
+"""m/s2, rad/s; a blow that is harder is hardly the motion of the body. An aeroplane that touches down turns as fast."""
 
 LONGEST_SHOCK = 0.5
 """s; after that the reading is believed again."""
@@ -276,9 +279,12 @@ def watch_shock(state, quality, sample, interval):
     quality.shock_time = begin + interval
     for i in range(6):
         level = quality.shock_level[i]
-        quality.excess[0, i] = HALF * (last_reading(state, i) - level)
-        quality.excess[1, i] = HALF * (read(sample, i) - level)
-        std = max(abs(quality.excess[0, i]), abs(quality.excess[1, i]))
+        before, after = last_reading(state, i) - level, read(sample, i) - level
+        std = max(abs(before), abs(after))
+        if std > (HARD_FORCE if i < 3 else HARD_RATE):
+            quality.excess[0, i] = HALF * before
+            quality.excess[1, i] = HALF * after
+            std *= HALF
         widen(quality, i, std, begin, quality.shock_time, interval)
     departure = abs(read(sample, quality.shock_axis) - quality.shock_level[quality.shock_axis])
     if departure < SHOCK_ENDS * quality.shock_size or quality.shock_time > LONGEST_SHOCK:
