@@ -177,7 +177,7 @@ def test_clocks_that_are_apart_leave_the_way_of_that_time_unknown(seed: int) -> 
 
 @seeds
 def test_fixes_that_have_jumped_and_are_believed_may_be_off_by_the_jump(seed: int) -> None:
-    """It fades with time, and nothing is added while they are refused."""
+    """It fades with time, and nothing is added while they are refused and the estimate has stayed where it was."""
     state = running(seed)
     before = published(state, MOUNTED)["pose_covariance"]
     motion = state["motion"]
@@ -189,6 +189,7 @@ def test_fixes_that_have_jumped_and_are_believed_may_be_off_by_the_jump(seed: in
     later = published(state, MOUNTED)["pose_covariance"] - before
     np.testing.assert_allclose(later, added * np.exp(-2.0), rtol=1e-9, atol=1e-9)
     state["trust"]["refused"][0, 0] = 1
+    state["trust"]["refused_innovation"][0, 0, :2] = np.exp(-1.0) * np.array([12.0, -9.0])
     np.testing.assert_array_equal(published(state, MOUNTED)["pose_covariance"], before)
 
 
