@@ -207,9 +207,9 @@ class Readout:
         found = inertial + other_complaints(state) + repeat_complaints(state) + samples + (travel if is_fault else [])
         # A wrong heading makes the fixes look faulty: warnings about the receivers would mislead.
         if not is_heading_contradicted(state):
-            found += aid_complaints(
-                state, settings, bool(clocks or inertial or axis_complaints(state)), bool(samples or travel)
-            )
+            # Clocks that may be apart are told after some more turns, and would explain much.
+            is_explained = bool(clocks or inertial or axis_complaints(state)) or state["motion"]["turns"]["lag"] != 0.0
+            found += aid_complaints(state, settings, is_explained, bool(samples or travel))
         return found + clocks
 
     @property

@@ -15,6 +15,9 @@ from eskf_ros.filter.state.time import NEVER, SECOND
 LONGEST_COMPARISON = 180 * SECOND
 """ns; after this time without turns or accelerations nothing is waited for."""
 
+MANY_TURNS = 30
+"""Windows of positions alone, whose courses scatter, from which on clocks may be said to be apart."""
+
 OTHER = 0.3
 """Correlation of changes of course with a gyro below which it does not show them."""
 
@@ -51,7 +54,8 @@ def motion_complaints(state: np.void) -> list[str]:
             "the velocities of the receiver fit its positions with east and north exchanged: they seem to be in "
             "North-East-Down axes, and are not used; publish East-North-Up (REP-103)",
         ]
-    return found + _turn_complaints(motion["turns"]) + _push_complaints(motion["pushes"])
+    fewest = 0 if motion["heard_stamp"] != NEVER else MANY_TURNS
+    return found + _turn_complaints(motion["turns"], fewest) + _push_complaints(motion["pushes"])
 
 
 def has_compared(state: np.void) -> bool:
@@ -62,8 +66,8 @@ def has_compared(state: np.void) -> bool:
     return bool(has_turned and has_pushed) or int(state["stamp"]) - int(state["first_stamp"]) > LONGEST_COMPARISON
 
 
-def _turn_complaints(turns: np.void) -> list[str]:
-    """Compare changes of course with the gyros."""
+def _turn_complaints(turns: np.void, fewest: int) -> list[str]:
+    """Compare changes of course with the gyros; clocks are said to be apart after ``fewest`` windows."""
     weight = max(float(turns["weight"]), 1e-9)
     mean = float(turns["course"]) / weight
     square = float(turns["course_square"]) / weight - mean * mean
@@ -74,7 +78,7 @@ def _turn_complaints(turns: np.void) -> list[str]:
     products = turns["product"] / weight - of_gyro * mean
     shown = products / np.sqrt(np.maximum(squares * square, 1e-18))
     lag = float(turns["lag"])
-    if lag != 0.0:
+    if lag != 0.0 and turns["count"] >= fewest:
         return [
             f"by their turns the receiver is stamped about {abs(lag):.1f} s {'later' if lag > 0.0 else 'earlier'} than "
             "the IMU: the clocks are apart; synchronise the clocks, or set the time_offset of the receiver"

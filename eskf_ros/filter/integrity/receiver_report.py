@@ -138,12 +138,17 @@ def _fault_complaints(state: np.void, settings: np.void, source: int, is_doubtfu
         # Late positions seem to wander, and are less certain than late velocities.
         at_position = likely
     if at_position:
-        what = "fixes" if both or not at_velocity else "positions"
+        has_velocity = state["receiver"]["velocity_nis"][source][1] > 0.0
+        what = "fixes" if both or not has_velocity else "positions"
         right = float(settings["gnss_time_offset"][source]) + at_position
+        # The offset is that of positions and velocities: where velocities are right, theirs takes it back.
+        is_alone = source == 0 and not both and not at_velocity and has_velocity
+        back = float(settings["velocity_time_offset"]) - at_position
+        with_it = f" and gnss.velocity_time_offset to {back:.3f}" if is_alone else ""
         texts.append(
             f"the {what}{_of(source)} are stamped {abs(at_position):.3f} s (+- {sigma[POSITION_TIME]:.3f}) "
-            f"{'late' if at_position < 0.0 else 'early'}: set {clock}.time_offset to {right:.3f}, or synchronise "
-            "the clocks"
+            f"{'late' if at_position < 0.0 else 'early'}: set {clock}.time_offset to {right:.3f}{with_it}, or "
+            "synchronise the clocks"
         )
     if at_velocity and not both:
         right = float(settings["velocity_time_offset"]) + at_velocity - at_position
