@@ -43,7 +43,9 @@ Array = NDArray[np.float64]
 
 J2000 = 630_763_200
 """s of GPS time at 2000-01-01 12:00."""
+
 LEAP_SECONDS = 18
+"""s; GPS time ahead of UTC since 2017."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 A sensor is clipped at the end of what it has ever read if that end comes back to the last bit more often than chance
 allows, or at a size that it has kept before. The truth is beyond: after n such samples anywhere up to n usual changes,
-or as far again as the reading. The middle is taken, with half the width for a standard deviation.
+or as far again as the reading. The middle is taken, with `WIDTH` times as much for a standard deviation.
 """
 
 from __future__ import annotations

@@ -27,14 +27,18 @@ def clear_doubt(quality):
 @njit
 def copy_doubt(state, lane):
     """Let another lane know which axes of the interval are doubted, and how much readings change."""
-    lane.quality.is_doubted = state.quality.is_doubted
+    for i in range(6):
+        lane.quality.change[i] = state.quality.change[i]
+        lane.quality.bend[i] = state.quality.bend[i]
+    if state.quality.is_doubted == 0:
+        clear_doubt(lane.quality)
+        return
+    lane.quality.is_doubted = 1
     for i in range(6):
         lane.quality.doubt[i] = state.quality.doubt[i]
         lane.quality.error[i] = state.quality.error[i]
         lane.quality.excess[0, i] = state.quality.excess[0, i]
         lane.quality.excess[1, i] = state.quality.excess[1, i]
-        lane.quality.change[i] = state.quality.change[i]
-        lane.quality.bend[i] = state.quality.bend[i]
 
 
 @njit

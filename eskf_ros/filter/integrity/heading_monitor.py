@@ -12,6 +12,7 @@ import numpy as np
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.history.records import XX, YY
+from eskf_ros.filter.integrity.scatter import has_calm_errors
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ATTITUDE, VELOCITY
 from eskf_ros.filter.state.time import NEVER, SECOND
@@ -80,9 +81,6 @@ SLIP_STD = math.radians(1.0)
 
 FEWEST_SLIPS = 30
 """Directions of travel from which on they are judged."""
-
-LARGEST_CALM = 0.6
-"""Share of the claims of the fixes that may last."""
 
 LARGEST_SPREAD = math.radians(5.0)
 """rad; standard deviation of the directions of travel of a robot that is made to travel in one."""
@@ -212,7 +210,7 @@ def slip_of(state: np.void) -> tuple[float, float] | None:
     """
     weight, total, square, count = (float(value) for value in state["heading_monitor"]["slip"])
     # Errors of fixes that last turn the velocity of the estimate, and its heading.
-    if count < FEWEST_SLIPS or not state["heading_known"] or state["scatter"]["calm"][0] > LARGEST_CALM:
+    if count < FEWEST_SLIPS or not state["heading_known"] or has_calm_errors(state, 0):
         return None
     mean = total / weight
     if square / weight - mean * mean > LARGEST_SPREAD**2:

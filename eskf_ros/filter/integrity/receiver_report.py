@@ -18,6 +18,7 @@ from eskf_ros.filter.integrity.receiver_monitor import (
     UNLIKELY,
 )
 from eskf_ros.filter.integrity.sample_report import stamp_complaints
+from eskf_ros.filter.integrity.scatter import has_calm_errors
 from eskf_ros.filter.measurements.stamp_noise import FEWEST_CUT
 from eskf_ros.filter.state.error_state import SOURCES
 
@@ -48,9 +49,6 @@ OPEN_SIGMAS = 3.0
 CERTAIN_TIME_STD = 0.02
 """s; standard deviation of the time offset of positions above which takeovers may come from one, or fixes that move
 otherwise than velocities: for `LONGEST_COMPARISON` at most."""
-
-NOTABLE_CALM = 0.6
-"""Share of the claims that must last for a note."""
 
 NOISY_IMU = (
     "imu.*_noise_density or imu.*_bias_random_walk is too small for it, its bias changes, or its axes or its scale are "
@@ -119,7 +117,7 @@ def _certain_faults(state: np.void, settings: np.void, source: int, is_doubtful:
     is_uncertain = np.abs(found) < DOUBTFUL_SIGMAS * sigma
     if is_doubtful:
         found[is_uncertain] = 0.0
-    if is_uncertain[VELOCITY_TIME] and _has_calm_errors(state, source):
+    if is_uncertain[VELOCITY_TIME] and has_calm_errors(state, source):
         # The velocity of the estimate follows the errors of the fixes, and is late or early with them.
         found[VELOCITY_TIME] = 0.0
     return np.asarray(found)
@@ -142,9 +140,9 @@ def _fault_complaints(state: np.void, settings: np.void, source: int, is_doubtfu
         what = "fixes" if both or not has_velocity else "positions"
         right = float(settings["gnss_time_offset"][source]) + at_position
         # The offset is that of positions and velocities: where velocities are right, theirs takes it back.
-        is_alone = source == 0 and not both and not at_velocity and has_velocity
+        only_positions = source == 0 and not both and not at_velocity and has_velocity
         back = float(settings["velocity_time_offset"]) - at_position
-        with_it = f" and gnss.velocity_time_offset to {back:.3f}" if is_alone else ""
+        with_it = f" and gnss.velocity_time_offset to {back:.3f}" if only_positions else ""
         texts.append(
             f"the {what}{_of(source)} are stamped {abs(at_position):.3f} s (+- {sigma[POSITION_TIME]:.3f}) "
             f"{'late' if at_position < 0.0 else 'early'}: set {clock}.time_offset to {right:.3f}{with_it}, or "
@@ -207,18 +205,12 @@ def aid_notes(state: np.void) -> list[str]:
         if state["scatter"]["cut_stamps"][source] >= FEWEST_CUT:
             continue
         change = float(state["scatter"]["change"][source])
-        if _has_calm_errors(state, source):
+        if has_calm_errors(state, source):
             found.append(
                 f"the fixes{_of(source)} change by {math.sqrt(change):.2f} times what they claim from one to the next: "
                 "their errors last. This is allowed for (gnss.correlation_time, gnss.correlated_share)"
             )
     return found
-
-
-def _has_calm_errors(state: np.void, source: int) -> bool:
-    """Say whether the fixes of a receiver err together for long: such errors look like faults of the installation."""
-    pairs = float(state["scatter"]["pairs"][source])
-    return bool(pairs > 2 * MANY_FIXES and state["scatter"]["calm"][source] > NOTABLE_CALM)
 
 
 def _velocity_complaints(state: np.void, source: int) -> list[str]:
@@ -275,12 +267,15 @@ def _departure_complaints(state: np.void, source: int) -> list[str]:
     may_be_late = is_early and float(state["installation"]["sigma"][source, POSITION_TIME]) > CERTAIN_TIME_STD
     if departures < FEW_DEPARTURES and (may_be_late or not takeovers):
         return []
-    departed, doubted = int(state["receiver"]["departure_stamp"][source]), int(state["trust"]["doubt_stamp"])
-    stamp = min([departed] * bool(departures) + [doubted] * bool(takeovers))
+    stamps = []
+    if departures:
+        stamps.append(int(state["receiver"]["departure_stamp"][source]))
+    if takeovers:
+        stamps.append(int(state["trust"]["doubt_stamp"]))
     of_stamps = "; or the stamps of the IMU, which jitter, are why" if stamp_complaints(state) else ""
     return [
         f"the receiver{_of(source)} and the IMU went different ways {departures + takeovers} times, once at the stamp "
-        f"{stamp * 1e-9:.1f}: multipath or spoofing; or {NOISY_IMU}{of_stamps}"
+        f"{min(stamps) * 1e-9:.1f}: multipath or spoofing; or {NOISY_IMU}{of_stamps}"
     ]
 
 

@@ -82,6 +82,12 @@ NOTABLE_SCATTER = 2.0
 WALK_GAIN = 0.005
 """Least weight of the newest pair in that part: new errors alone give 0 +- 0.14 then."""
 
+MANY_PAIRS = 100.0
+"""Pairs of fixes from which on it is told that they err together."""
+
+TOLD_CALM = 0.6
+"""Share of the claims that must last for it to be told."""
+
 WALK_CLIP = 8.0
 """One pair counts in that part with at most this many times the present changes."""
 
@@ -217,3 +223,9 @@ def distance_from_path(lane, source, settings, work):
             distance += work.jacobian[i, place + i] * lane.optional[place - ERROR_SIZE + i]
         total += distance * distance / (lane.covariance[POSITION + i, POSITION + i] + noise)
     return total / 3.0
+
+
+def has_calm_errors(state: np.void, source: int) -> bool:
+    """Say whether the fixes of a receiver err together for long: they look like wrong installations and headings."""
+    scatter = state["scatter"]
+    return bool(scatter["pairs"][source] > MANY_PAIRS and scatter["calm"][source] > TOLD_CALM)

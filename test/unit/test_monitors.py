@@ -1,0 +1,89 @@
+"""Monitors of the installation, of the direction of travel and of the errors of fixes, one kernel at a time."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from eskf_ros.filter.integrity.fault_effects import POSITION_TIME, write_effect_on_position
+from eskf_ros.filter.integrity.fix_errors import update_shares
+from eskf_ros.filter.integrity.heading_monitor import slip_of, watch_slip
+from eskf_ros.filter.integrity.installation_monitor import forget_uncertain_turns
+from eskf_ros.filter.state.error_state import ATTITUDE, VELOCITY
+from eskf_ros.filter.state.time import SECOND
+from support.kernels import make_settings, make_state, make_work
+
+SETTINGS = make_settings()
+
+
+def uncertain(block: int, std: float, **changes: Any) -> Any:
+    """A state whose three errors from index ``block`` on have this standard deviation."""
+    state = make_state(**changes)
+    for i in range(3):
+        state["covariance"][block + i, block + i] = std**2
+    return state
+
+
+@pytest.mark.parametrize(("speed", "known"), [(0.02, 0.0), (0.2, 0.2 * 0.04 / (0.04 + 3e-4)), (20.0, 20.0)])
+def test_a_velocity_within_its_sigma_says_nothing_of_the_time(speed: float, known: float) -> None:
+    effect = np.zeros((3, 7))
+    write_effect_on_position(uncertain(VELOCITY, 0.01, velocity=(speed, 0.0, 0.0)), 0, effect, SETTINGS)
+    assert effect[0, POSITION_TIME] == pytest.approx(known, rel=1e-3, abs=1e-12)
+
+
+def test_a_turn_within_the_sigma_of_the_attitude_says_nothing_of_the_lever_arm() -> None:
+    effect = np.zeros((3, 7))
+    effect[1, 0], effect[0, 1], effect[2, POSITION_TIME] = 0.01, 1.0, 5.0
+    forget_uncertain_turns(uncertain(ATTITUDE, 0.01), effect)
+    assert effect[1, 0] == 0.0
+    assert effect[0, 1] == pytest.approx(1.0, rel=1e-3)
+    assert effect[2, POSITION_TIME] == 5.0
+
+
+def travelled(angles_deg: Any) -> Any:
+    """A state that has travelled straight on at these angles to x of base_link, a second each."""
+    state = make_state(velocity=(10.0, 0.0, 0.0))
+    for k, angle in enumerate(angles_deg):
+        state["stamp"] = (k + 1) * SECOND
+        watch_slip(state, -math.radians(angle))
+    return state
+
+
+def test_the_direction_of_travel_is_known_where_it_stays() -> None:
+    found = slip_of(travelled([8.0, 7.0, 9.0, 8.0] * 10))
+    assert found is not None
+    assert math.degrees(found[0]) == pytest.approx(8.0, abs=0.1)
+    assert math.degrees(found[1]) < 1.0
+
+
+def test_the_direction_of_travel_is_not_known_by_few_seconds_or_where_it_changes_or_fixes_err_for_long() -> None:
+    assert slip_of(travelled([8.0] * 20)) is None
+    assert slip_of(travelled([30.0, -20.0] * 30)) is None, "a multirotor flies in any direction"
+    state = travelled([8.0] * 40)
+    state["scatter"]["pairs"][0], state["scatter"]["calm"][0] = 500.0, 0.9
+    assert slip_of(state) is None
+
+
+def test_the_direction_of_travel_is_not_asked_for_in_turns_or_at_rest() -> None:
+    for velocity, rate in (((1.0, 0.0, 0.0), 0.0), ((10.0, 0.0, 0.0), 0.3)):
+        state = make_state(velocity=velocity)
+        state["stamp"], state["imu"]["smooth_rate"] = SECOND, (0.0, 0.0, rate)
+        watch_slip(state, 0.0)
+        assert not state["heading_monitor"]["slip"].any()
+
+
+def test_fixes_that_hardly_change_are_calm_however_little_they_walk() -> None:
+    """They change by 5 % of their claim, and half of that walks: nearly all of the claim lasts."""
+    state, work = make_state(), make_work()
+    state["error_size"] = 15
+    state["recovery"]["absolute_interval"] = SECOND
+    state["scatter"]["white"][0] = state["scatter"]["spread"][0] = 1.0
+    state["scatter"]["pairs"][0], state["scatter"]["change"][0], state["scatter"]["walk"][0] = 500.0, 0.05, 0.0005
+    update_shares(state, state.copy(), 0, SETTINGS, work)
+    assert state["scatter"]["calm"][0] == pytest.approx(0.95)
+    state["scatter"]["walk"][0] = 0.03
+    update_shares(state, state.copy(), 0, SETTINGS, work)
+    assert state["scatter"]["calm"][0] >= 0.95
