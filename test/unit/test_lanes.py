@@ -124,7 +124,7 @@ def test_velocities_in_other_axes_are_found_by_four_windows_in_motion() -> None:
     for exchanged in (True, False):
         motion = state["motion"]
         motion["axes"], motion["has_other_axes"] = 0.0, 0
-        for _ in range(50):
+        for _ in range(200):
             motion["start_way"] = (0.1, -0.2)
             compare_axes(motion, (0.4, 0.3))
         for window in range(4):
