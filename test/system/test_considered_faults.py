@@ -119,6 +119,8 @@ def test_what_is_found_is_in_the_published_covariance(name: str, given: Filter) 
         ("velocity in north, east, down", TOLD_VELOCITY, 2, 300.0),
         ("velocities stamped 0.13 s late", DEFAULT_VELOCITY, 0, 2.0),
         ("steps of 15 m, 20 s every minute", DEFAULT_POSITION, 5, 30.0),
+        ("vibration 15 m/s2, clipped at 2 g: boat", DEFAULT_VELOCITY, 1, 3.0),
+        ("rates clipped at 0.2 rad/s: field_robot", DEFAULT_VELOCITY, 1, 3.0),
         ("drawn away by 0.5 m/s, velocity too", TOLD_VELOCITY, 0, 25.0),
         ("train, rough line", DEFAULT_VELOCITY, 0, 3.0),
         ("RTK claims 1 cm and wanders 0.3 m", TOLD_POSITION, 2, 2.0),

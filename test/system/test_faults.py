@@ -117,6 +117,7 @@ def test_a_fault_is_named_and_no_other(name: str) -> None:
         ("clocks of IMU and receiver 1.2 s apart", TOLD_POSITION, 1),
         ("clocks of IMU and receiver 1.2 s apart", DEFAULT_POSITION, 0),
         ("lasting errors 1.5 m, 30 s", TOLD_POSITION, 2),
+        ("rates clipped at 0.2 rad/s: boat", DEFAULT_VELOCITY, 0),
         ("RTK claims 1 cm and wanders 0.3 m: boat", DEFAULT_VELOCITY, 0),
     ],
 )

@@ -167,7 +167,7 @@ def test_a_gyro_that_is_clipped_while_the_robot_turns_in_place_opens_the_heading
 
 def test_a_rate_that_stops_at_the_same_size_twice_is_clipped_although_more_was_read_before() -> None:
     values = readings(40.0)
-    values[500, 5] = 0.9
+    values[500, 5], values[600, 5] = 0.9, -0.9
     values[2000:2030, 5] = 0.4
     values[2500:2540, 5] = -0.4
     state, widened = run(values)
