@@ -40,7 +40,7 @@ COMPILED: bool = numba is not None and not numba.config.DISABLE_JIT
 PROGRESS_PERIOD = 5.0
 """Seconds from one sentence about compiling to the next."""
 
-USUAL_COUNT = 475
+USUAL_COUNT = 488
 """Functions, each type of arguments counted, that a first start compiles, about: for the estimate of progress only."""
 
 OPTIMISATION = 1
