@@ -112,6 +112,7 @@ setup(
             # Independent GNSS libraries, wheels for Linux on x86-64; without them these comparisons are skipped.
             "pyrtklib5; sys_platform == 'linux' and platform_machine == 'x86_64' and python_version < '3.13'",
             "pytest",
+            "pytest-xdist",  # `./run test` runs the files of tests on two processes
             "ruff",
             "setuptools>=70.1",  # makes wheels without the package wheel
             "sidereon; sys_platform == 'linux' and platform_machine == 'x86_64'",
