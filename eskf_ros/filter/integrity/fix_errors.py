@@ -24,6 +24,9 @@ from eskf_ros.filter.state.error_state import ERROR_SIZE, NOWHERE, POSITION, SOU
 NOTABLE_WALK = 0.5
 """Ratio of the part of the changes that is not taken back to the variance that fixes claim above which they walk."""
 
+WALK_PAIRS = 300.0
+"""Pairs of fixes from which on that ratio is three standard deviations of what white errors give; of fewer, more is."""
+
 NOTABLE_CALM = 0.5
 """Ratio of the changes from fix to fix to the variance they claim below which the rest is an error that lasts."""
 
@@ -55,7 +58,8 @@ def update_shares(state, lane, source, settings, work):
     if not is_learned or not is_enough(scatter.pairs[source], scatter.change[source]):
         return
     used, change = max(scatter.white[source], LEAST_WHITE), scatter.change[source]
-    walks = scatter.walk[source] > NOTABLE_WALK * change
+    least = NOTABLE_WALK * math.sqrt(max(1.0, WALK_PAIRS / scatter.pairs[source]))
+    walks = scatter.walk[source] > least * change
     scatter.walking[source] = scatter.walk[source] if walks else 0.0
     new = change - 0.5 * scatter.walking[source]
     scatter.white[source] = new if new > NOTABLE_SCATTER else 1.0
