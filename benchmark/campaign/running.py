@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation, Slerp
 
 from campaign import independent
 from campaign.fault import RATE, Fault, Filter
 from eskf_ros.filter.history.records import RECORD
 from eskf_ros.filter.navigator import Navigator
-from eskf_ros.filter.state.enums import SENSOR_STREAMS, Stream, Verdict
+from eskf_ros.filter.state.enums import CONSTRAINT_INTERVAL, SENSOR_STREAMS, Stream, Verdict
 from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.episodes import ClockSet
 from eskf_ros.simulate.imu import ImuMount
@@ -49,8 +50,9 @@ class Trace:
     ``error``, ``sigma``: horizontal, m. ``heading_error``, ``heading_sigma``: rad; where the heading is not
     ``is_known`` they say nothing. ``speed``, ``turn``: of the truth, m/s and rad/s. ``said``: sentences, with the time
     (s) at which each was first seen, numbers left out; ``final``: those at the end, as they are. ``offered``,
-    ``refused``: measurements, and those of them that were not fused. ``rest_speed`` (m,), ``rest_turn`` (k,): the truth
-    at the stamps at which rest and a standing heading were taken for granted; ``rest`` (m,): the former, s.
+    ``refused``: measurements, and those of them that were not fused. ``rest_speed`` (m,): the truth at the stamps at
+    which rest was taken for granted; ``rest`` (m,): these stamps, s. ``rest_turn`` (k,): the mean of the truth over the
+    seconds in which no turn was taken for granted, of which the constraint takes the mean rate.
     """
 
     seconds: Array
@@ -239,6 +241,8 @@ def _trace(
     speed = np.linalg.norm(recording.truth_velocity_map, axis=1)
     rate = np.linalg.norm(recording.truth_angular_rate_body, axis=1)
 
+    turned = cumulative_trapezoid(rate, truth_seconds, initial=0.0)
+
     def at(stamps: NDArray[np.int64], quantity: Array) -> Array:
         return np.interp((stamps - start) * 1e-9, truth_seconds, quantity)
 
@@ -260,5 +264,5 @@ def _trace(
         refused=int(np.count_nonzero(~np.isin(aids["verdict"], (Verdict.FUSED, Verdict.WEIGHED_DOWN)))),
         rest=(rest - start) * 1e-9,
         rest_speed=at(rest, speed),
-        rest_turn=at(turning, rate),
+        rest_turn=(at(turning, turned) - at(turning - CONSTRAINT_INTERVAL, turned)) / (1e-9 * CONSTRAINT_INTERVAL),
     )
