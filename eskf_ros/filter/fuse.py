@@ -11,6 +11,7 @@ from eskf_ros.filter.alignment.heading_sensors import update_unknown_heading
 from eskf_ros.filter.alignment.levelling import reset_level_to_moving
 from eskf_ros.filter.history.timeline import open_record
 from eskf_ros.filter.inertial.navigation_frame import heading_of
+from eskf_ros.filter.integrity.fix_errors import forget_spread
 from eskf_ros.filter.integrity.heading_monitor import (
     watch_course,
     watch_field,
@@ -24,7 +25,7 @@ from eskf_ros.filter.integrity.receiver import fuse_receiver, reset_for_new_solu
 from eskf_ros.filter.integrity.receiver_monitor import watch_receiver
 from eskf_ros.filter.integrity.recovery import note, recover
 from eskf_ros.filter.integrity.repeated_fixes import is_repeated, note_copy, note_fused_fix
-from eskf_ros.filter.integrity.restart import reset_alignment
+from eskf_ros.filter.integrity.restart import reset_to_level
 from eskf_ros.filter.measurements import (
     baro,
     body_velocity,
@@ -43,7 +44,7 @@ from eskf_ros.filter.measurements.stamp_noise import note_cut_stamp
 from eskf_ros.filter.output.local_odometry import note_jump
 from eskf_ros.filter.state.augmented_states import update_error_size
 from eskf_ros.filter.state.enums import SENSOR_STREAMS, Stream, Verdict
-from eskf_ros.filter.state.lanes import FILTER
+from eskf_ros.filter.state.lanes import FILTER, HUMBLE
 from eskf_ros.filter.stationarity.detector import update_rest_evidence, watch_rest, watch_wheels
 from eskf_ros.filter.stationarity.static_window import update_evidence_from_fix, update_evidence_from_velocity
 from eskf_ros.geodesy.rotation import wrapped
@@ -83,7 +84,8 @@ def fuse(states, aids, i, settings, work):
     # What came before the first sample that counts must leave no trace, and no window may begin with it.
     if state.level_known == 1 and watch_motion(state, aid, settings):
         # The filter has followed velocities in other axes.
-        reset_alignment(state)
+        reset_to_level(state)
+        forget_spread(state, states[HUMBLE], settings)
     if aid.stream == Stream.GNSS_VELOCITY and aid.source == 0 and state.motion.has_other_axes == 1:
         aid.verdict = Verdict.CONTRADICTED
         return

@@ -116,7 +116,8 @@ def test_what_is_found_is_in_the_published_covariance(name: str, given: Filter) 
     ("name", "given", "seed", "worst"),
     [
         ("one gyro stuck for 40 s", TOLD_POSITION, 2, 10.0),
-        ("velocity in north, east, down", TOLD_VELOCITY, 2, 300.0),
+        ("velocity in north, east, down", TOLD_VELOCITY, 2, 15.0),
+        ("gyro bias ramp 0.5 deg/s in 400 s", TOLD_VELOCITY, 1, 1.0),
         ("velocities stamped 0.13 s late", DEFAULT_VELOCITY, 0, 2.0),
         ("steps of 15 m, 20 s every minute", DEFAULT_POSITION, 5, 30.0),
         ("vibration 15 m/s2, clipped at 2 g: boat", DEFAULT_VELOCITY, 1, 3.0),

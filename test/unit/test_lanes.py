@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from eskf_ros.filter.history.records import AID
-from eskf_ros.filter.integrity.humble_lane import EVIDENCE, reset_to_humble_lane, weigh_evidence
+from eskf_ros.filter.integrity.humble_lane import EVIDENCE, reset_to_humble_lane, update_doubt, weigh_evidence
 from eskf_ros.filter.integrity.motion_monitor import compare_axes, offset_by_jumps
 from eskf_ros.filter.integrity.refusal import FEWEST, rival_offset
 from eskf_ros.filter.layout import blank_state
@@ -68,6 +68,25 @@ def test_accelerometer_biases_are_judged_on_their_own() -> None:
     assert np.sqrt(states[0]["covariance"][GYRO_BIAS, GYRO_BIAS]) == pytest.approx(HUMBLE_GYRO_STD)
 
 
+@pytest.mark.parametrize(("bias", "lasting"), [(10.0 * HUMBLE_GYRO_STD, 0.7), (0.0, 0.0)])
+def test_doubt_about_the_imu_fades_in_a_minute_and_that_about_biases_that_have_moved_lasts(
+    bias: float, lasting: float
+) -> None:
+    states = lanes(bias)
+    reset_to_humble_lane(states, False, make_work())
+    state = states[0]
+    for passed, doubt, bias_doubt in (
+        (30, 0.5, max(0.5, lasting)),
+        (61, 0.0, lasting),
+        (599, 0.0, lasting),
+        (601, 0, 0),
+    ):
+        state["stamp"] = (1000 + passed) * SECOND
+        update_doubt(state)
+        assert state["doubt"] == pytest.approx(doubt)
+        assert state["bias_doubt"] == pytest.approx(bias_doubt if bias else 0.0)
+
+
 def messages_to_takeover(nis: float, humble_nis: float) -> int:
     """How many velocities with these NIS in filter and humble lane it takes until the humble lane takes over."""
     states = lanes(0.0)
@@ -118,7 +137,7 @@ def test_after_a_jump_the_estimate_is_off_by_as_much_as_it_has_followed() -> Non
     assert offset_by_jumps(state) == (15.0, 0.0)
 
 
-def test_velocities_in_other_axes_are_found_by_four_windows_in_motion() -> None:
+def test_velocities_in_other_axes_are_found_by_two_windows_in_motion() -> None:
     """However long the robot stood before; ways that agree say that they are not."""
     state = lanes(0.0)[0]
     for exchanged in (True, False):
@@ -127,7 +146,7 @@ def test_velocities_in_other_axes_are_found_by_four_windows_in_motion() -> None:
         for _ in range(200):
             motion["start_way"] = (0.1, -0.2)
             compare_axes(motion, (0.4, 0.3))
-        for window in range(4):
+        for window in range(2):
             assert motion["has_other_axes"] == 0, window
             motion["start_way"] = (18.0, 5.0) if exchanged else (5.0, 18.0)
             compare_axes(motion, (5.5, 17.5))

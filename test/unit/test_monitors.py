@@ -75,6 +75,19 @@ def test_the_direction_of_travel_is_not_asked_for_in_turns_or_at_rest() -> None:
         assert not state["heading_monitor"]["slip"].any()
 
 
+def test_few_pairs_of_fixes_must_walk_further_to_be_said_to() -> None:
+    """Of white errors the part that is not taken back scatters by 0.3 of the changes after 90 pairs, later by 0.14."""
+    state, work = make_state(), make_work()
+    state["error_size"] = 15
+    state["recovery"]["absolute_interval"] = SECOND // 5
+    state["scatter"]["white"][0] = state["scatter"]["spread"][0] = state["scatter"]["change"][0] = 1.0
+    state["scatter"]["walk"][0] = 0.65
+    for pairs, walks in ((90.0, False), (400.0, True)):
+        state["scatter"]["pairs"][0] = pairs
+        update_shares(state, state.copy(), 0, SETTINGS, work)
+        assert bool(state["scatter"]["walking"][0]) == walks, pairs
+
+
 def test_fixes_that_hardly_change_are_calm_however_little_they_walk() -> None:
     """They change by 5 % of their claim, and half of that walks: nearly all of the claim lasts."""
     state, work = make_state(), make_work()

@@ -35,6 +35,7 @@ from eskf_ros.filter.integrity.refusal import (
     other_stream,
     receiver_of,
 )
+from eskf_ros.filter.integrity.restart import OPENED_GYRO_BIAS_STD, OPENED_TILT_STD
 from eskf_ros.filter.measurements import gnss_position, gnss_velocity
 from eskf_ros.filter.measurements.jacobians import clear
 from eskf_ros.filter.measurements.kalman_update import apply, judge, update
@@ -100,6 +101,12 @@ together, which least squares over one epoch do not know.
 LOST_HEADING_STD = 0.5
 """rad; a humble lane that knows the heading no better starts anew from the filter."""
 
+LASTING_BIAS_DOUBT = 0.7
+"""Doubt about biases that does not fade: biases that have moved move again, most by temperature."""
+
+LASTING_BIAS_TIME = 600.0
+"""s; after this time without a takeover it ends."""
+
 BIAS_GATE = 11.34
 """NIS of three biases of the filter in the humble lane beyond which they are wrong: the chi-square quantile of 0.99."""
 
@@ -109,15 +116,8 @@ BELIEVED = 16.0
 DRIFT = 1.5
 """Standard deviations (`heading_corrections.one_way`) of the heading from which on the biases are doubted."""
 
-OPENED_TILT_STD = 0.1
-"""rad per axis; of roll and pitch after a fault of the IMU."""
-
 OPENED_HEADING_STD = 0.5
 """rad; of the heading after a fault of the IMU."""
-
-
-OPENED_GYRO_BIAS_STD = 0.01
-"""rad/s; of the gyro bias after a fault of the IMU."""
 
 
 @njit
@@ -308,13 +308,13 @@ def is_heading_apart(states, settings):
 
 @njit
 def update_doubt(state):
-    """Let the doubts about the IMU fade from 1 to 0 over ``doubt_time`` after a takeover."""
-    if state.doubt == 0.0:
+    """Let the doubts about the IMU fade from 1 to 0 over ``doubt_time`` after a takeover; those about biases last."""
+    if state.doubt == 0.0 and state.bias_doubt == 0.0:
         return
     passed = (state.stamp - state.trust.doubt_stamp) * 1e-9
-    fades = max(0.0, 1.0 - passed / state.trust.doubt_time)
-    state.bias_doubt = min(state.bias_doubt, fades)
-    state.doubt = fades
+    state.doubt = max(0.0, 1.0 - passed / state.trust.doubt_time)
+    lasting = LASTING_BIAS_DOUBT if passed < LASTING_BIAS_TIME else 0.0
+    state.bias_doubt = min(state.bias_doubt, max(state.doubt, lasting))
 
 
 @njit

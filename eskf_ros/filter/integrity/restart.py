@@ -4,8 +4,16 @@ from __future__ import annotations
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.heading_search import forget_search
+from eskf_ros.filter.alignment.heading_sensors import reset_to_unknown_heading
 from eskf_ros.filter.integrity.installation_monitor import forget_faults
+from eskf_ros.filter.state.error_state import ATTITUDE, GYRO_BIAS
 from eskf_ros.filter.state.time import NEVER
+
+OPENED_TILT_STD = 0.1
+"""rad per axis; of roll and pitch after a fault of the IMU, or of what has corrected them."""
+
+OPENED_GYRO_BIAS_STD = 0.01
+"""rad/s; of the gyro bias after such a fault."""
 
 
 @njit
@@ -29,3 +37,15 @@ def reset_alignment(state):
     for i in range(3):
         state.position_map[i] = 0.0
         state.velocity_map[i] = 0.0
+
+
+@njit
+def reset_to_level(state):
+    """Drop all but the level: it is doubted, and the next fix gives the position, the motion after it the heading."""
+    reset_to_unknown_heading(state)
+    state.position_known = 0
+    for i in range(3):
+        if i < 2:
+            state.covariance[ATTITUDE + i, ATTITUDE + i] += OPENED_TILT_STD**2
+        state.covariance[GYRO_BIAS + i, GYRO_BIAS + i] += OPENED_GYRO_BIAS_STD**2
+    forget_faults(state)
