@@ -602,5 +602,5 @@ def test_covariance_of_a_gyro_bias_at_rest_is_exactly_symmetric() -> None:
         state = random_state(seed)
         up = navigation_frame.local_up(state)
         rate = (1e-3, -2e-3, 5e-4)
-        levelling.update_gyro_bias_at_rest(state, (0.0, 0.0, 0.0), 1e-4, rate, up, 5.0, True, make_settings())
+        levelling.update_gyro_bias_at_rest(state, (0.0, 0.0, 0.0), 1e-4, rate, 0.0, up, 5.0, True, make_settings())
         assert (core(state) == core(state).T).all()

@@ -14,7 +14,7 @@ from eskf_ros.filter.inertial.navigation_frame import heading_of, local_up, rese
 from eskf_ros.filter.state.augmented_states import inflate_tilt_by_scale
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_CAPACITY, ERROR_SIZE, GYRO_BIAS
 from eskf_ros.filter.state.time import NEVER
-from eskf_ros.filter.stationarity.residual_motion import can_be_bias, is_moving, note_sway
+from eskf_ros.filter.stationarity.residual_motion import can_be_bias, is_moving, note_sway, variance_of_half
 from eskf_ros.filter.stationarity.seen_motion import unseen_turn
 from eskf_ros.filter.stationarity.static_window import Window
 from eskf_ros.geodesy.earth import EARTH_RATE, STANDARD_GRAVITY
@@ -31,6 +31,12 @@ LEVELLING = np.dtype(
 
 DRIFTED = 2.0
 """Ratio of the present tilt variance to that of a new level above which a robot in motion is levelled again."""
+
+TURN_SIGMAS = 4.0
+"""Standard deviations by which gravity must turn in the readings of a run of still windows for a robot that tilts."""
+
+LEAST_TURN = 5e-4
+"""m/s2 per second (0.003 deg/s); readings of gravity that change more slowly may be those of a drifting bias."""
 
 UNKNOWN_SPEED = 10.0
 """m/s; speed assumed where it is unknown: in a turn, levelling takes its centripetal acceleration for tilt."""
@@ -57,12 +63,15 @@ def level(state, sums, count, interval, is_rest, settings):
             return
         is_rest = False
     force = (force[0] - accel_bias[0], force[1] - accel_bias[1], force[2] - accel_bias[2])
-    strength = math.sqrt(dot(force, force))
+    strength, turn_variance = math.sqrt(dot(force, force)), 0.0
     if strength < 0.5 * STANDARD_GRAVITY:
         return
     if is_rest:
         note_sway(state, is_first, settings)
-        tilt_noise = tilt_noise_at_rest(state, duration, strength, settings)
+        change, variance = change_of_gravity(state, settings)
+        force, rate = without_turn(force, rate, change, duration)
+        turn_variance = variance / strength**2
+        tilt_noise = tilt_noise_at_rest(state, duration, strength, settings) + (0.5 * duration) ** 2 * turn_variance
         if is_level_better_known(state, accel_variance / strength**2 + tilt_noise):
             return
     else:
@@ -72,7 +81,7 @@ def level(state, sums, count, interval, is_rest, settings):
     measured = rotate(to_matrix(state.attitude), (force[0] / strength, force[1] / strength, force[2] / strength))
     reset_attitude(state, shortest_turn(measured, up))
     reset_tilt(state, up, strength, accel_bias, accel_variance, tilt_noise, settings)
-    update_gyro_bias_at_rest(state, gyro_bias, gyro_variance, rate, up, duration, is_rest, settings)
+    update_gyro_bias_at_rest(state, gyro_bias, gyro_variance, rate, turn_variance, up, duration, is_rest, settings)
     if is_rest:
         state.search.turning_age = 0.0
     # The parameter holds at the first start only: after a restart the robot may have turned.
@@ -127,6 +136,45 @@ def tilt_noise_at_rest(state, duration, strength, settings):
     walked = settings.accel_bias_random_walk**2 * duration / 3.0
     swayed = sway_left(state.residual.force_variance, duration, settings)
     return (settings.accel_noise_density**2 / duration + walked + swayed) / strength**2
+
+
+@njit
+def change_of_gravity(state, settings):
+    """Return the change of the mean force in a run of still windows (m/s2 per second, IMU axes), and its variance.
+
+    It is that from the first half of its first window to the second half of its last one, and zero where it is no more
+    than noise. A robot that tilts while it stands, as one that is loaded does, would pass for one with another gyro
+    bias.
+    """
+    window, half = state.window, 0.5 * settings.static_duration
+    n, passed = window.samples - window.half_samples, (state.stamp - window.still_start) * 1e-9 - half
+    variance = 2.0 * variance_of_half(state) / passed**2
+    if variance == 0.0:
+        return (0.0, 0.0, 0.0), 0.0
+    change = (
+        ((window.total[0] - window.half_force[0]) / n - window.still_force[0]) / passed,
+        ((window.total[1] - window.half_force[1]) / n - window.still_force[1]) / passed,
+        ((window.total[2] - window.half_force[2]) / n - window.still_force[2]) / passed,
+    )
+    if dot(change, change) > TURN_SIGMAS**2 * (variance + LEAST_TURN**2):
+        return change, variance
+    return (0.0, 0.0, 0.0), variance
+
+
+@njit
+def without_turn(force, rate, change, duration):
+    """Return the force at the end of a run of still windows, and the mean rate without the turn that gravity shows.
+
+    ``force``, ``rate``: means over ``duration`` (s); ``change``: of the force (m/s2 per second). Gravity that turns in
+    the body by w x f comes from the rate w = change x f / f^2.
+    """
+    turn = cross(change, force)
+    square = dot(force, force)
+    half = 0.5 * duration
+    return (
+        (force[0] + half * change[0], force[1] + half * change[1], force[2] + half * change[2]),
+        (rate[0] - turn[0] / square, rate[1] - turn[1] / square, rate[2] - turn[2] / square),
+    )
 
 
 @njit
@@ -227,8 +275,10 @@ def mean_rate_std(duration, settings):
 
 
 @njit
-def update_gyro_bias_at_rest(state, prior_bias, prior, mean_rate, up, duration, is_rest, settings):
+def update_gyro_bias_at_rest(state, prior_bias, prior, mean_rate, turn_variance, up, duration, is_rest, settings):
     """Set the gyro bias to the weighted mean of its prior and of the mean rate at rest minus the Earth rate.
+
+    A turn that gravity has shown is taken out of ``mean_rate`` (rad/s) already, with the variance ``turn_variance``.
 
     The prior (``prior_bias``, rad/s, IMU axes, with variance ``prior``) and the mean rate are weighed along the
     vertical and across it, because without a heading only the vertical part of the Earth rate is known. The unknown
@@ -251,6 +301,7 @@ def update_gyro_bias_at_rest(state, prior_bias, prior, mean_rate, up, duration, 
     elif state.heading_known == 1:
         known = (earth[0], earth[1], earth[2])
         horizontal_variance = noise + horizontal_square * settings.initial_heading_std**2
+    horizontal_variance += turn_variance
     # A turn that a dual antenna does not exclude may be what the gyro reads.
     vertical_variance += unseen_turn(state)
     vertical_gain = prior / (prior + vertical_variance) if is_rest and prior > 0.0 else 0.0

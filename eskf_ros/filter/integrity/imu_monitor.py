@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.stationarity.residual_motion import can_be_bias
+from eskf_ros.filter.stationarity.residual_motion import can_be_bias, is_moving
 from eskf_ros.geodesy.earth import STANDARD_GRAVITY
 from eskf_ros.geodesy.rotation import dot, rotate
 
@@ -110,7 +110,7 @@ def watch_input(state, still, settings):
 def watch_bias(state, rate, settings):
     """Count still windows in a row with the same mean rate (rad/s, IMU axes) that exceeds the expected gyro bias."""
     nothing = (0.0, 0.0, 0.0)
-    if can_be_bias(rate, nothing, settings.gyro_bias_std, 0.0):
+    if is_moving(state) or can_be_bias(rate, nothing, settings.gyro_bias_std, 0.0):
         state.imu_monitor.biased_windows = 0
         return
     last = state.imu_monitor.biased_rate

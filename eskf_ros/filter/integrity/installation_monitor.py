@@ -114,12 +114,13 @@ INSTALLATION = np.dtype(
 @njit
 def learn_faults(state, aid, size, gate, work, settings):
     """Carry the effect of the faults on the state through one update, and learn from its innovation."""
-    if state.heading_known == 0 or aid.verdict in (Verdict.RESET, Verdict.TAKEOVER):
-        state.installation.stamp = NEVER
-        if aid.verdict == Verdict.TAKEOVER:
-            # A wrong lever arm or time offset may be why the filter seemed wrong: the evidence stays.
-            return
+    if state.heading_known == 0 or aid.verdict == Verdict.RESET:
         forget_faults(state)
+        return
+    if aid.verdict == Verdict.TAKEOVER and state.installation.stamp != NEVER:
+        # A wrong lever arm or time offset may be why the filter seemed wrong: the evidence stays. The humble lane has
+        # heard the same receivers, and has followed the faults much as the filter has.
+        carry_absorbed(state, settings)
         return
     if state.covariance[HEADING, HEADING] > LEARNING_HEADING_STD**2:
         # Far from the truth the derivatives are others.

@@ -9,7 +9,7 @@ from scipy.special import chdtri
 
 from eskf_ros.filter.integrity.fault_effects import FAULTS, GYRO_DRIFT, GYRO_SCALE, POSITION_TIME, VELOCITY_TIME
 from eskf_ros.filter.integrity.heading_monitor import given_heading_complaints
-from eskf_ros.filter.integrity.installation_monitor import FAULT_PRIOR, LASTING_LOOKS, TIME_ERROR
+from eskf_ros.filter.integrity.installation_monitor import FAULT_PRIOR, LASTING_LOOKS, LEAST_FAULT, TIME_ERROR
 from eskf_ros.filter.integrity.motion_report import LONGEST_COMPARISON, has_compared
 from eskf_ros.filter.integrity.receiver_monitor import (
     FEW_DEPARTURES,
@@ -79,7 +79,7 @@ def aid_complaints(state: np.void, settings: np.void, is_explained: bool, is_imu
         # Those faults explain drifts, contradictions and a high NIS: no sentences of their own.
         found += paths + faults + lies
         # One that is not certain for long may do so, too; or axes of the IMU, which take their time.
-        is_open = bool(state["installation"]["found"][source].any()) and not _is_implausible(state, source)
+        is_open = _may_be_installation(state, source) and not _is_implausible(state, source)
         if is_certain and not is_open and not paths and not faults and not lies:
             found += _velocity_complaints(state, source) + _departure_complaints(state, source)
     if state["recovery"]["resets"]:
@@ -238,6 +238,15 @@ def _may_be_late(state: np.void, source: int) -> bool:
     )
     is_early = int(state["stamp"]) - int(state["first_stamp"]) < LONGEST_COMPARISON
     return abs(late) > max(TIME_ERROR, OPEN_SIGMAS * std) or (is_early and not 0.0 < std < CERTAIN_TIME_STD)
+
+
+def _may_be_installation(state: np.void, source: int) -> bool:
+    """Say whether a fault of the installation is certain or, early on, likely to become so."""
+    installation = state["installation"]
+    found, estimate, sigma = (installation[name][source] for name in ("found", "estimate", "sigma"))
+    is_early = int(state["stamp"]) - int(state["first_stamp"]) < LONGEST_COMPARISON
+    likely = (np.abs(estimate) > OPEN_SIGMAS * sigma) & (np.abs(estimate) > LEAST_FAULT)
+    return bool(found.any() or (is_early and likely.any()))
 
 
 def _path_complaints(state: np.void, source: int) -> list[str]:

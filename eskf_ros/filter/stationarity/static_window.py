@@ -23,9 +23,13 @@ STATIC_WINDOW = np.dtype(
         ("samples", "i8"),
         ("total", "f8", (6,)),
         ("square_total", "f8", (6,)),
+        ("half_samples", "i8"),
+        ("half_force", "f8", (3,)),
         ("still_stamp", "i8"),
         ("still_samples", "i8"),
         ("still_total", "f8", (6,)),
+        ("still_start", "i8"),
+        ("still_force", "f8", (3,)),
         ("motion_stamp", "i8"),
         ("last_fix_stamp", "i8", (SOURCES,)),
         ("last_fix_ecef", "f8", (SOURCES, 3)),
@@ -39,8 +43,10 @@ STATIC_WINDOW = np.dtype(
 sensors.
 
 - ``start``, ``samples``, ``total``, ``square_total``: the window: first stamp (ns), samples, sums (m/s2, rad/s).
+  ``half_samples``, ``half_force``: samples in its first half, and their force (m/s2).
 - ``still_stamp``, ``still_samples``, ``still_total``: the end of the last still window (ns), samples and sums of the
-  run.
+  run. ``still_start``, ``still_force``: the start of its first window (ns), and the mean force (m/s2) in the first half
+  of that.
 - ``motion_stamp``: when another sensor last proved motion (ns).
 - ``last_fix_*``: the last fix by receiver, because their antennas are apart: stamp (ns), ECEF (m), variance (m2).
 - ``anchor_*``: the fix by receiver from which the window started.
@@ -92,6 +98,7 @@ def update_static_window(state, settings):
     if state.window.start == NEVER:
         state.window.start = state.stamp
         state.window.samples = 0
+        state.window.half_samples = 0
         for source in range(SOURCES):
             state.window.anchor_stamp[source] = state.window.last_fix_stamp[source]
             for i in range(3):
@@ -106,11 +113,15 @@ def update_static_window(state, settings):
         state.window.square_total[3 + i] += state.angular_rate[i] ** 2
     state.window.samples += 1
     duration = (state.stamp - state.window.start) * 1e-9
+    if 2.0 * duration <= settings.static_duration:
+        state.window.half_samples = state.window.samples
+        for i in range(3):
+            state.window.half_force[i] = state.window.total[i]
     if duration < settings.static_duration or state.window.samples < MINIMUM_WINDOW_SAMPLES:
         return Window.OPEN
-    still = (
-        is_still(state, settings) and state.window.motion_stamp < state.window.start and is_same_rest(state, settings)
-    )
+    # A creep may be slower than what proves motion at once, and quiet.
+    moved = max(state.window.motion_stamp, state.rest.moving_stamp) >= state.window.start
+    still = is_still(state, settings) and not moved and is_same_rest(state, settings)
     window = Window.REST if still else Window.MOTION
     if (
         still
@@ -125,6 +136,9 @@ def update_static_window(state, settings):
         if state.window.still_samples == 0:
             for i in range(6):
                 state.window.still_total[i] = 0.0
+            state.window.still_start = state.window.start
+            for i in range(3):
+                state.window.still_force[i] = state.window.half_force[i] / state.window.half_samples
         state.window.still_samples += state.window.samples
         for i in range(6):
             state.window.still_total[i] += state.window.total[i]

@@ -185,9 +185,13 @@ def inflate_or_reset_by_majority(state, aids, first, end, which, settings, work)
         for k in range(count):
             work.signal_square[k] = work.signal_innovation[k] ** 2
         fault = median(work.signal_square, count, work) / MEDIAN_OF_SQUARES
-        block = POSITION if which == 0 else VELOCITY
+        block, lasting = POSITION if which == 0 else VELOCITY, settings.position_error_at
         for i in range(3):
-            state.covariance[block + i, block + i] += fault
+            state.covariance[block + i, block + i] += 0.05 * fault
+            if which == 0 and lasting < state.error_size:
+                # What these ranges agree on may be an error of theirs as well, and the next ones have it, too.
+                place = lasting + i
+                state.covariance[place, place] += fault / settings.pseudorange.error_std[i] ** 2
         state.covariance[settings.clock_at + which, settings.clock_at + which] += fault
 
 
