@@ -490,6 +490,24 @@ def test_a_bias_that_warms_up_is_followed_at_rest() -> None:
     assert state["stamp"] - state["window"]["still_stamp"] < 3_000_000_000
 
 
+@pytest.mark.parametrize("rate_deg", [0.05, 0.2])
+def test_a_robot_that_tilts_while_it_stands_has_no_other_gyro_bias(rate_deg: float) -> None:
+    """It pitches, as one that is loaded or that settles does; gravity in the readings shows by how much."""
+    settings = make_settings(alignment__static_duration=2.0)
+    state, rng = waiting(), np.random.default_rng(3)
+    pitching, bias = math.radians(rate_deg), np.array([0.001, -0.002, 0.001])
+    for k in range(600):
+        attitude = Rotation.from_euler("y", pitching * k / RATE_HZ)
+        force, rate = at_rest(state, attitude, np.zeros(3), bias)
+        state["stamp"] += 10_000_000
+        state["specific_force"] = force + 0.01 * rng.normal(size=3)
+        state["angular_rate"] = rate + (0.0, pitching, 0.0) + 1e-3 * rng.normal(size=3)
+        update_rest(state, settings)
+    sigma = np.sqrt(np.diag(core(state))[12:])
+    assert (np.abs(state["gyro_bias"] - bias) < 3.0 * sigma + 1e-4).all()
+    assert abs(state["gyro_bias"][1] - bias[1]) < 0.5 * pitching
+
+
 def test_restart_while_standing_still_counts_from_zero() -> None:
     """The IMU falls silent on a parked robot: afterwards the gyro bias is what it was before, not several times it."""
     settings = make_settings(alignment__static_duration=2.0)

@@ -9,6 +9,9 @@ import numpy as np
 from eskf_ros.compiled import njit
 from eskf_ros.geodesy.rotation import wrapped
 
+LAGS = 6
+"""Windows by which the receiver may be stamped later or earlier than the IMU for it to be seen by turns."""
+
 TURNS = np.dtype(
     [
         ("count", "f8"),
@@ -18,8 +21,9 @@ TURNS = np.dtype(
         ("gyro", "f8", (3,)),
         ("gyro_square", "f8", (3,)),
         ("product", "f8", (3,)),
-        ("shifted", "f8", (2,)),
-        ("last", "f8", (2,)),
+        ("shifted", "f8", (2 * LAGS + 1,)),
+        ("recent", "f8", (LAGS, 2)),
+        ("recent_count", "i8"),
         ("last_stamp", "i8"),
         ("lag", "f8"),
     ],
@@ -27,9 +31,10 @@ TURNS = np.dtype(
 )
 """Sums over windows of the change of course and the integrated rates (rad, axes of base_link), weighted (1/rad2).
 
-``shifted``: products of the course with the rate about z of the window before, and of the rate with the course of the
-window before, which ``last``, ``last_stamp`` keep. ``lag``: by how much the receiver is stamped later than the IMU (s);
-0 where it is less than notable, or not known.
+``shifted``: products of the course with the rate about z of the window that is k windows earlier, at `LAGS` + k.
+``recent``, ``recent_count``, ``last_stamp``: rate about z and course of the windows before this one, the newest first;
+how many of them follow each other without a hole; the end of the newest (ns). ``lag``: by how much the receiver is
+stamped later than the IMU (s); 0 where it is less than notable, or not known.
 """
 
 PUSHES = np.dtype(
@@ -94,12 +99,18 @@ def add_turn(turns, before, after, turn, variance, start, passed):
     turns.weight = remains * turns.weight + weight
     turns.course = remains * turns.course + weight * course
     turns.course_square = remains * turns.course_square + weight * course * course
-    turns.shifted[0] *= remains
-    turns.shifted[1] *= remains
-    if start == turns.last_stamp:
-        turns.shifted[0] += weight * course * turns.last[0]
-        turns.shifted[1] += weight * turn[2] * turns.last[1]
-    turns.last[0], turns.last[1] = turn[2], course
+    if start != turns.last_stamp:
+        turns.recent_count = 0
+    for k in range(2 * LAGS + 1):
+        turns.shifted[k] *= remains
+    turns.shifted[LAGS] += weight * turn[2] * course
+    for k in range(min(turns.recent_count, LAGS)):
+        turns.shifted[LAGS + 1 + k] += weight * course * turns.recent[k, 0]
+        turns.shifted[LAGS - 1 - k] += weight * turn[2] * turns.recent[k, 1]
+    for k in range(LAGS - 1, 0, -1):
+        turns.recent[k, 0], turns.recent[k, 1] = turns.recent[k - 1, 0], turns.recent[k - 1, 1]
+    turns.recent[0, 0], turns.recent[0, 1] = turn[2], course
+    turns.recent_count += 1
     turns.last_stamp = start + round(passed * 1e9)
     for i in range(3):
         turns.gyro[i] = remains * turns.gyro[i] + weight * turn[i]
@@ -112,21 +123,29 @@ def add_turn(turns, before, after, turn, variance, start, passed):
 def lag_of(turns, length):
     """Return by how much (s) the course is stamped later than the gyro: the top of the parabola through the products.
 
-    They are those of the course with the gyro of the same window (of a ``length`` in s), the one before and the one
-    after.
+    They are those of the course with the gyro of windows (of a ``length`` in s) before, of the same, and after. Turns
+    that come at regular times show again and again: what is far off is asked only where the same windows show nothing.
     """
-    before, after, same = turns.shifted[0], turns.shifted[1], turns.product[2]
     square = turns.course_square - turns.course**2 / turns.weight
-    bend = before - 2.0 * same + after
-    is_enough = turns.count >= FEWEST_TURNS and square * turns.count > TURNED * turns.weight
-    if not is_enough or same + before + after <= 0.0 or bend >= 0.0:
+    if turns.count < FEWEST_TURNS or square * turns.count <= TURNED * turns.weight:
         return 0.0
     gyro_square = turns.gyro_square[2] - turns.gyro[2] ** 2 / turns.weight
-    largest = max(max(before, after), same - turns.gyro[2] * turns.course / turns.weight)
-    lag = 0.5 * (after - before) / bend * length
+    shown = SAME * math.sqrt(gyro_square * square)
+    mean = turns.gyro[2] * turns.course / turns.weight
+    reach = 1 if turns.shifted[LAGS] - mean > shown else LAGS
+    best = LAGS
+    for k in range(LAGS - reach, LAGS + reach + 1):
+        if turns.shifted[k] > turns.shifted[best]:
+            best = k
+    best = min(max(best, 1), 2 * LAGS - 1)
+    after, same, before = turns.shifted[best - 1], turns.shifted[best], turns.shifted[best + 1]
+    bend = before - 2.0 * same + after
+    if same + before + after <= 0.0 or bend >= 0.0:
+        return 0.0
+    lag = (best - LAGS + 0.5 * (after - before) / bend) * length
     # What has been told is held unless the turns speak against it.
     held = HELD if turns.lag * lag > 0.0 else 1.0
-    is_shown = largest > held * SAME * math.sqrt(gyro_square * square)
+    is_shown = max(max(before, after), same - mean) > held * shown
     return lag if abs(lag) > held * NOTABLE_LAG and is_shown else 0.0
 
 
