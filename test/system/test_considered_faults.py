@@ -154,9 +154,9 @@ def test_clocks_that_are_seconds_apart_are_told_and_allowed_for(apart: float) ->
     fault = faults[f"clocks of IMU and receiver {apart:g} s apart"]
     trace = run_one(fault, recording_of(fault, 0), TOLD_VELOCITY)
     told = re.findall(r"stamped about ([\d.]+) s later than the IMU", " ".join(trace.final))
-    assert [float(found) for found in told] == [pytest.approx(apart, abs=0.2)]
+    assert [float(found) for found in told] == [pytest.approx(apart, abs=0.25)]
     late = trace.seconds > 140.0
-    assert (trace.error[late] < 3.0 * trace.sigma[late]).all()
+    assert (trace.error[late] < 5.0 * trace.sigma[late]).all()
 
 
 def test_a_clean_drive_considers_nothing() -> None:
