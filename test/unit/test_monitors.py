@@ -12,6 +12,8 @@ from eskf_ros.filter.integrity.fault_effects import POSITION_TIME, write_effect_
 from eskf_ros.filter.integrity.fix_errors import update_shares
 from eskf_ros.filter.integrity.heading_monitor import slip_of, watch_slip
 from eskf_ros.filter.integrity.installation_monitor import forget_uncertain_turns
+from eskf_ros.filter.integrity.motion_report import _compared
+from eskf_ros.filter.integrity.motion_sums import add_push, add_turn
 from eskf_ros.filter.state.error_state import ATTITUDE, VELOCITY
 from eskf_ros.filter.state.time import SECOND
 from support.kernels import make_settings, make_state, make_work
@@ -100,3 +102,49 @@ def test_fixes_that_hardly_change_are_calm_however_little_they_walk() -> None:
     state["scatter"]["walk"][0] = 0.03
     update_shares(state, state.copy(), 0, SETTINGS, work)
     assert state["scatter"]["calm"][0] >= 0.95
+
+
+def turned(rate_of: Any, lag: float, seed: int) -> list[float]:
+    """The lags (s) told in 200 s of turns at ``rate_of`` (s) -> rad/s, with a receiver stamped ``lag`` later."""
+    rng, turns = np.random.default_rng(seed), make_state()["motion"]["turns"]
+    seconds = np.arange(0.0, 201.0, 0.01)
+    turn = np.concatenate([[0.0], np.cumsum(rate_of(seconds[:-1]) * 0.01)])
+    told = []
+    for k in range(10, 200):
+        course = np.interp([k - 1.0 - lag, k - lag], seconds, turn) + 0.005 * rng.normal(size=2)
+        gyro = float(np.interp(k, seconds, turn) - np.interp(k - 1.0, seconds, turn))
+        before, after = ((10.0 * math.cos(angle), 10.0 * math.sin(angle)) for angle in course)
+        add_turn(turns, before, after, (0.0, 0.0, gyro), 2.0 * 0.005**2, (k - 1) * SECOND, 1.0)
+        told.append(float(turns["lag"]))
+    return told
+
+
+@pytest.mark.parametrize("period", [30.0, 400.0])
+def test_smooth_turns_are_no_sign_of_clocks_that_are_apart(period: float) -> None:
+    for seed in range(10):
+        assert not any(turned(lambda t: 0.25 * np.sin(2.0 * np.pi * t / period), 0.0, seed)), seed
+
+
+@pytest.mark.parametrize("lag", [-3.6, -1.2, 1.2, 2.4, 4.2])
+def test_corners_show_clocks_that_are_seconds_apart(lag: float) -> None:
+    assert turned(lambda t: 0.3 * (t % 17.0 < 5.0), lag, 0)[-1] == pytest.approx(lag, abs=0.25)
+
+
+def test_slopes_are_no_mounting() -> None:
+    """Gravity on slopes of half a minute is as strong as braking: the angle to the travel is as certain as is said."""
+    sigmas = []
+    for seed in range(60):
+        rng, pushes = np.random.default_rng(seed), make_state()["motion"]["pushes"]
+        pull, slope = np.zeros(2), np.zeros(2)
+        for _ in range(150):
+            pull, slope = 0.8 * pull + 0.5 * rng.normal(size=2), 0.97 * slope + 0.12 * rng.normal(size=2)
+            before, after = np.array([20.0, 0.0]), np.array([20.0, 0.0]) + pull
+            course = math.atan2(after[1], before[0] + after[0])
+            along = math.cos(course) * pull[0] + math.sin(course) * pull[1]
+            left = math.cos(course) * pull[1] - math.sin(course) * pull[0]
+            add_push(pushes, tuple(before), tuple(after), (along + slope[0], left + slope[1], 9.8), 1.0)
+        compared = _compared(pushes)
+        assert compared is not None
+        matrix, std = compared
+        sigmas.append(math.atan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1]) / std)
+    assert 0.5 < np.mean(np.square(sigmas)) < 2.0

@@ -24,11 +24,20 @@ OTHER = 0.3
 FEWEST_PUSHES = 30
 """Windows with an acceleration from which on those are compared."""
 
+MANY_PUSHES = 60
+"""Such windows from which on a small angle to the direction of travel is told: fewer do not show how errors last."""
+
+LARGE_YAW = math.radians(20.0)
+"""rad; an angle that is told without waiting for them."""
+
 PUSHED = 0.2
 """m2/s4; mean square of the accelerations along each axis from which on they are."""
 
 MISSED = 0.5
 """Share of the specific force that may stay unexplained by accelerations where axes are judged by it."""
+
+MOST_TOGETHER = 0.9
+"""Largest product of the correlations from window to window of accelerations and of what they leave unexplained."""
 
 MIRRORED = -0.5
 """Determinant of a comparison, as a share of that of a rotation, below which axes are mirrored."""
@@ -100,7 +109,10 @@ def _turn_complaints(turns: np.void, fewest: int) -> list[str]:
 def _compared(pushes: np.void) -> tuple[np.ndarray, float] | None:
     """Return the matrix (2, 2) from acceleration to specific force, and the standard deviation (rad) of its angle.
 
-    None without enough accelerations, or where they do not explain the force.
+    None without enough accelerations, or where they do not explain the force. What is left of the force lasts from
+    window to window, on slopes most of all, and so do accelerations: their products are fewer than they seem, by
+    (1 + r) / (1 - r) with the product r of both correlations (Bayley and Hammersley, The effective number of
+    independent observations in an autocorrelated time series, 1946).
     """
     count = float(pushes["count"])
     square = pushes["acceleration_square"]
@@ -111,7 +123,12 @@ def _compared(pushes: np.void) -> tuple[np.ndarray, float] | None:
     missed = float(pushes["force_square"]) - explained
     if missed > MISSED * float(pushes["force_square"]):
         return None
-    return matrix, math.sqrt(max(missed, 0.0) / (explained * count))
+    step = pushes["acceleration_next"]
+    missed_next = float(pushes["force_next"]) - float(np.sum(matrix * pushes["product_next"]))
+    missed_next += float(np.trace(matrix @ step @ matrix.T))
+    together = missed_next / max(missed, 1e-9) * float(np.trace(step)) / float(np.trace(square))
+    together = min(max(together, 0.0), MOST_TOGETHER)
+    return matrix, math.sqrt(max(missed, 0.0) / (explained * count) * (1.0 + together) / (1.0 - together))
 
 
 def _push_complaints(pushes: np.void) -> list[str]:
@@ -144,7 +161,8 @@ def travel_complaints(state: np.void, settings: np.void, mount_rpy_deg: Sequence
         (yaw, std), what = (-slip[0], slip[1]), "velocity"
     else:
         return [], False
-    if abs(yaw) < max(NOTABLE_YAW, YAW_SIGMAS * std):
+    is_early = what == "accelerations" and state["motion"]["pushes"]["count"] < MANY_PUSHES
+    if abs(yaw) < max(LARGE_YAW if is_early else NOTABLE_YAW, YAW_SIGMAS * std):
         return [], False
     roll, pitch, told = mount_rpy_deg
     wanted = (told + math.degrees(yaw) + 180.0) % 360.0 - 180.0

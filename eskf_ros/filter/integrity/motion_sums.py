@@ -45,12 +45,18 @@ PUSHES = np.dtype(
         ("acceleration_square", "f8", (2, 2)),
         ("force_square", "f8"),
         ("product", "f8", (2, 2)),
+        ("last", "f8", (2, 2)),
+        ("force_next", "f8"),
+        ("acceleration_next", "f8", (2, 2)),
+        ("product_next", "f8", (2, 2)),
     ],
     align=True,
 )
 """Sums over windows of acceleration along the course and to its left, and specific force (m/s2, x and y of base_link).
 
 Both without their running means: tilts and biases change slowly. ``product``: row force, column acceleration.
+``last``: force and acceleration of the window before; ``*_next``: sums of the products of those of consecutive windows,
+the product of force and acceleration both ways.
 """
 
 MEMORY = 600.0
@@ -80,6 +86,9 @@ SAME = 0.7
 
 HELD = 0.7
 """Share of the limits of a lag beyond which it stays once it is known."""
+
+BETTER = 0.02
+"""Correlation by which courses must fit the gyro better with a lag: in smooth turns many fit alike."""
 
 NOTABLE_LAG = 0.6
 """s; a time between course and gyro from which on it is told: less is found by the installation monitor."""
@@ -145,7 +154,8 @@ def lag_of(turns, length):
     lag = (best - LAGS + 0.5 * (after - before) / bend) * length
     # What has been told is held unless the turns speak against it.
     held = HELD if turns.lag * lag > 0.0 else 1.0
-    is_shown = max(max(before, after), same - mean) > held * shown
+    better = same - 0.125 * (after - before) ** 2 / bend - turns.shifted[LAGS]
+    is_shown = max(max(before, after), same - mean) > held * shown and better > held * BETTER / SAME * shown
     return lag if abs(lag) > held * NOTABLE_LAG and is_shown else 0.0
 
 
@@ -166,12 +176,22 @@ def add_push(pushes, before, after, push, time):
     for i in range(2):
         pushes.mean_acceleration[i] += share * (acceleration[i] - pushes.mean_acceleration[i])
         pushes.mean_force[i] += share * (push[i] / time - pushes.mean_force[i])
+    now = (
+        (push[0] / time - pushes.mean_force[0], push[1] / time - pushes.mean_force[1]),
+        (acceleration[0] - pushes.mean_acceleration[0], acceleration[1] - pushes.mean_acceleration[1]),
+    )
+    pushes.force_next *= remains
     for i in range(2):
-        force = push[i] / time - pushes.mean_force[i]
+        force, last = now[0][i], pushes.last[0, i]
         pushes.force_square += force * force
+        pushes.force_next += force * last
         for j in range(2):
-            of_course = acceleration[j] - pushes.mean_acceleration[j]
-            pushes.product[i, j] = remains * pushes.product[i, j] + force * of_course
-            pushes.acceleration_square[i, j] = (
-                remains * pushes.acceleration_square[i, j] + (acceleration[i] - pushes.mean_acceleration[i]) * of_course
+            pushes.product[i, j] = remains * pushes.product[i, j] + force * now[1][j]
+            pushes.acceleration_square[i, j] = remains * pushes.acceleration_square[i, j] + now[1][i] * now[1][j]
+            pushes.product_next[i, j] = (
+                remains * pushes.product_next[i, j] + force * pushes.last[1, j] + last * now[1][j]
             )
+            pushes.acceleration_next[i, j] = remains * pushes.acceleration_next[i, j] + now[1][i] * pushes.last[1, j]
+    for i in range(2):
+        for j in range(2):
+            pushes.last[i, j] = now[i][j]
