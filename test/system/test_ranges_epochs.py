@@ -331,6 +331,23 @@ def test_a_wrong_state_is_outvoted(off: tuple[float, float, float]) -> None:
     assert np.linalg.norm(error[:2]) < 10.0
 
 
+@pytest.mark.parametrize("off", [(40.0, 0.0, 0.0), (-20.0, 25.0, 20.0)])
+def test_ranges_that_agree_on_a_wrong_place_are_not_believed_more_with_each_epoch(off: tuple[float, ...]) -> None:
+    """Reflections can agree: for 15 s all ranges are those of another place, which may be an error that lasts."""
+    recording = drive(3, 130.0)
+    ranges = simulate_ranges(recording, 12)
+    here = recording.frame.to_ecef(np.zeros((1, 3)))[0]
+    there = recording.frame.to_ecef(np.array([off]))[0]
+    for k in np.flatnonzero((ranges.seconds - ranges.seconds[0] > 60.0) & (ranges.seconds - ranges.seconds[0] < 75.0)):
+        way = ranges.signals[k]["satellite"] - here
+        ranges.signals[k]["pseudorange"] -= way @ (there - here) / np.linalg.norm(way, axis=1)
+    outcome = follow(recording, ranges, tight_navigator(recording, ranges__correlation_time=120.0))
+    assert outcome.navigator.state["tight"]["range_faults"][0] >= 1
+    assert sane(outcome, 5.0)
+    assert np.linalg.norm(outcome.error[:, :2], axis=1)[outcome.seconds > 5.0].max() < 25.0
+    assert np.linalg.norm(outcome.error[outcome.seconds > 120.0, :2], axis=1).max() < 5.0
+
+
 def test_satellites_that_return_are_welcome() -> None:
     """After a minute without, position and clock are as uncertain as they are wrong: nothing is refused."""
     recording = drive(3, 130.0)

@@ -6,8 +6,8 @@ here is a function of the state and of the signals with one stamp, in their tota
 
 - A common innovation of whole milliseconds is a jump of the receiver clock; any other common innovation is a clock that
   was set anew. Neither costs a satellite.
-- More than half of at least `FEWEST_TO_JUDGE` satellites outside their gates: the state is wrong, and its variance is
-  inflated by what they show.
+- More than half of at least `FEWEST_TO_JUDGE` satellites outside their gates: the state is wrong, or all ranges are by
+  an error that lasts. The variances of both are inflated by what they show.
 - A single satellite outside its gate is rejected (fault exclusion); from `HUBER` standard deviations up to the gate its
   noise is inflated (Huber, Robust Statistics, section 7.8).
 
@@ -63,6 +63,10 @@ from eskf_ros.geodesy.rotation import cross, dot, rotate, to_matrix
 
 FEWEST_TO_JUDGE = 5
 """Satellites, at least, whose majority outvotes the state."""
+
+STATE_SHARE = 0.05
+"""Share of the variance that the position gains where the error that all ranges have in common is estimated, too: more
+often than the state it is reflections that are wrong, and the next epochs have them as well."""
 
 FEWEST_FOR_CLOCK = 3
 """Satellites, at least, that show a clock that was set anew."""
@@ -170,7 +174,8 @@ def inflate_or_reset_by_majority(state, aids, first, end, which, settings, work)
     """Reset the clock or inflate position or velocity, if most satellites contradict the state.
 
     A common innovation is a clock that was set anew. Otherwise the variance of position or velocity and of the clock
-    gains the median of the squared innovations, scaled to a variance.
+    gains the median of the squared innovations, scaled to a variance; so does the common error of the ranges, and then
+    the position `STATE_SHARE` of it.
     """
     count, gate = work.signal_count, settings.gate[aids[first].stream, 1]
     if count < FEWEST_FOR_CLOCK or 2 * outside(work, 0.0, gate) <= count:
@@ -185,13 +190,12 @@ def inflate_or_reset_by_majority(state, aids, first, end, which, settings, work)
         for k in range(count):
             work.signal_square[k] = work.signal_innovation[k] ** 2
         fault = median(work.signal_square, count, work) / MEDIAN_OF_SQUARES
-        block, lasting = POSITION if which == 0 else VELOCITY, settings.position_error_at
+        block, place = POSITION if which == 0 else VELOCITY, settings.position_error_at
+        can_last = which == 0 and place < state.error_size
         for i in range(3):
-            state.covariance[block + i, block + i] += 0.05 * fault
-            if which == 0 and lasting < state.error_size:
-                # What these ranges agree on may be an error of theirs as well, and the next ones have it, too.
-                place = lasting + i
-                state.covariance[place, place] += fault / settings.pseudorange.error_std[i] ** 2
+            state.covariance[block + i, block + i] += STATE_SHARE * fault if can_last else fault
+            if can_last:
+                state.covariance[place + i, place + i] += fault / settings.pseudorange.error_std[i] ** 2
         state.covariance[settings.clock_at + which, settings.clock_at + which] += fault
 
 
