@@ -146,11 +146,12 @@ def change_of_gravity(state, settings):
     than noise. A robot that tilts while it stands, as one that is loaded does, would pass for one with another gyro
     bias.
     """
-    window, half = state.window, 0.5 * settings.static_duration
-    n, passed = window.samples - window.half_samples, (state.stamp - window.still_start) * 1e-9 - half
-    variance = 2.0 * variance_of_half(state) / passed**2
+    window, variance = state.window, variance_of_half(state)
     if variance == 0.0:
         return (0.0, 0.0, 0.0), 0.0
+    n = window.samples - window.half_samples
+    passed = (state.stamp - window.still_start) * 1e-9 - 0.5 * settings.static_duration
+    variance *= 2.0 / passed**2
     change = (
         ((window.total[0] - window.half_force[0]) / n - window.still_force[0]) / passed,
         ((window.total[1] - window.half_force[1]) / n - window.still_force[1]) / passed,
