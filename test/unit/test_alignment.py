@@ -490,6 +490,28 @@ def test_a_bias_that_warms_up_is_followed_at_rest() -> None:
     assert state["stamp"] - state["window"]["still_stamp"] < 3_000_000_000
 
 
+@pytest.mark.parametrize("speed", [0.0, 3.0])
+def test_an_even_turn_is_a_bias_of_the_gyro_at_rest_only(speed: float) -> None:
+    """3 deg/s for 20 s, as smooth as at rest: no robot turns like that but a boat, a train, or one in a simulation."""
+    settings, state = make_settings(alignment__static_duration=2.0), waiting()
+    state["position_known"], state["velocity_map"] = int(speed > 0.0), (speed, 0.0, 0.0)
+    force, rate = at_rest(state, Rotation.identity(), np.zeros(3), np.zeros(3))
+    watch(state, settings, 20.0, force, rate + (0.0, 0.0, math.radians(3.0)))
+    assert (state["imu_monitor"]["biased_windows"] >= 3) == (speed == 0.0)
+
+
+@pytest.mark.parametrize("seen", [False, True])
+def test_a_creep_that_is_seen_is_not_levelled_as_rest(seen: bool) -> None:
+    """Velocities of 0.3 m/s prove no motion at once, but over some seconds."""
+    settings, state = make_settings(alignment__static_duration=2.0, alignment__moving_start_after=60.0), waiting()
+    force, rate = at_rest(state, Rotation.identity(), np.zeros(3), np.zeros(3))
+    for _ in range(10):
+        watch(state, settings, 0.5, force, rate)
+        if seen:
+            state["rest"]["moving_stamp"] = state["stamp"]
+    assert state["level_known"] == int(not seen)
+
+
 @pytest.mark.parametrize("rate_deg", [0.05, 0.2])
 def test_a_robot_that_tilts_while_it_stands_has_no_other_gyro_bias(rate_deg: float) -> None:
     """It pitches, as one that is loaded or that settles does; gravity in the readings shows by how much."""
