@@ -38,6 +38,9 @@ TURN_SIGMAS = 4.0
 LEAST_TURN = 5e-4
 """m/s2 per second (0.003 deg/s); readings of gravity that change more slowly may be those of a drifting bias."""
 
+LARGEST_CHANGE_STD = 1e-2
+"""m/s2 per second (0.06 deg/s); where the change is known no better, a body that sways says nothing of a slow turn."""
+
 UNKNOWN_SPEED = 10.0
 """m/s; speed assumed where it is unknown: in a turn, levelling takes its centripetal acceleration for tilt."""
 
@@ -143,8 +146,8 @@ def change_of_gravity(state, settings):
     """Return the change of the mean force in a run of still windows (m/s2 per second, IMU axes), and its variance.
 
     It is that from the first half of its first window to the second half of its last one, and zero where it is no more
-    than noise. A robot that tilts while it stands, as one that is loaded does, would pass for one with another gyro
-    bias.
+    than noise, or noise hides it. A robot that tilts while it stands, as one that is loaded does, would pass for one
+    with another gyro bias.
     """
     window, variance = state.window, variance_of_half(state)
     if variance == 0.0:
@@ -152,6 +155,8 @@ def change_of_gravity(state, settings):
     n = window.samples - window.half_samples
     passed = (state.stamp - window.still_start) * 1e-9 - 0.5 * settings.static_duration
     variance *= 2.0 / passed**2
+    if variance > LARGEST_CHANGE_STD**2:
+        return (0.0, 0.0, 0.0), 0.0
     change = (
         ((window.total[0] - window.half_force[0]) / n - window.still_force[0]) / passed,
         ((window.total[1] - window.half_force[1]) / n - window.still_force[1]) / passed,
