@@ -490,6 +490,20 @@ def test_a_bias_that_warms_up_is_followed_at_rest() -> None:
     assert state["stamp"] - state["window"]["still_stamp"] < 3_000_000_000
 
 
+def test_the_force_of_a_body_that_sways_says_nothing_of_a_slow_turn() -> None:
+    """Held in the hand: accelerations of 0.2 m/s2, which are no gravity that turns."""
+    settings, state = make_settings(alignment__static_duration=2.0), waiting()
+    force, rate = at_rest(state, Rotation.identity(), np.zeros(3), np.zeros(3))
+    for k in range(210):
+        state["stamp"] += 10_000_000
+        state["specific_force"] = force + (0.2 * math.sin(0.03 * k), 0.0, 0.0)
+        state["angular_rate"] = rate
+        update_rest(state, settings)
+    assert state["level_known"] == 1
+    assert np.abs(state["gyro_bias"]).max() < 2e-4
+    assert np.sqrt(np.diag(core(state))[12:]).max() < 1e-3
+
+
 @pytest.mark.parametrize("speed", [0.0, 3.0])
 def test_an_even_turn_is_a_bias_of_the_gyro_at_rest_only(speed: float) -> None:
     """3 deg/s for 20 s, as smooth as at rest: no robot turns like that but a boat, a train, or one in a simulation."""
