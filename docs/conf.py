@@ -24,7 +24,7 @@ PAGES = {
     "Set up": ["profiles", "receivers", "tuning", "calibrate", "troubleshooting", "heading", "migrate", "nav2"],
     "More to use": ["api", "simulate", "smoother", "tight", "ranges", "views", "watch", "fleets"],
     "Learn": ["lessons/README", "lessons/*", "theory", "architecture"],
-    "How good it is": ["results", "trust", "consistency", "benchmarks", "small_boards", "peers"],
+    "How good it is": ["results", "trust", "trust_independent", "consistency", "benchmarks", "small_boards", "peers"],
     "Change it": ["developing", "add_a_measurement", "releasing", "../CONTRIBUTING", "../CHANGELOG"],
     "What it promises": ["../QUALITY_DECLARATION"],
 }

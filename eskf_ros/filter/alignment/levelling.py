@@ -74,7 +74,9 @@ def level(state, sums, count, interval, is_rest, settings):
         change, variance = change_of_gravity(state, settings)
         force, rate = without_turn(force, rate, change, duration)
         turn_variance = variance / strength**2
-        tilt_noise = tilt_noise_at_rest(state, duration, strength, settings) + (0.5 * duration) ** 2 * turn_variance
+        tilt_noise = tilt_noise_at_rest(state, duration, strength, settings)
+        if dot(change, change) > 0.0:
+            tilt_noise += (0.5 * duration) ** 2 * turn_variance
         if is_level_better_known(state, accel_variance / strength**2 + tilt_noise):
             return
     else:
