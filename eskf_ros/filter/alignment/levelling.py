@@ -38,8 +38,8 @@ TURN_SIGMAS = 4.0
 LEAST_TURN = 5e-4
 """m/s2 per second (0.003 deg/s); readings of gravity that change more slowly may be those of a drifting bias."""
 
-LARGEST_CHANGE_STD = 1e-2
-"""m/s2 per second (0.06 deg/s); where the change is known no better, a body that sways says nothing of a slow turn."""
+LARGEST_CHANGE_STD = 7e-3
+"""m/s2 per second (0.04 deg/s); where the change is known no better, a body that sways says nothing of a slow turn."""
 
 UNKNOWN_SPEED = 10.0
 """m/s; speed assumed where it is unknown: in a turn, levelling takes its centripetal acceleration for tilt."""
