@@ -38,8 +38,8 @@ TURN_SIGMAS = 4.0
 LEAST_TURN = 5e-4
 """m/s2 per second (0.003 deg/s); readings of gravity that change more slowly may be those of a drifting bias."""
 
-LARGEST_CHANGE_STD = 7e-3
-"""m/s2 per second (0.04 deg/s); where the change is known no better, a body that sways says nothing of a slow turn."""
+LARGEST_CHANGE_STD = 1e-2
+"""m/s2 per second (0.06 deg/s); where the change is known no better, a body that sways says nothing of a slow turn."""
 
 UNKNOWN_SPEED = 10.0
 """m/s; speed assumed where it is unknown: in a turn, levelling takes its centripetal acceleration for tilt."""
@@ -73,7 +73,9 @@ def level(state, sums, count, interval, is_rest, settings):
         note_sway(state, is_first, settings)
         change, variance = change_of_gravity(state, settings)
         force, rate = without_turn(force, rate, change, duration)
-        turn_variance = variance / strength**2
+        # Readings that are those remembered from where the robot was left are not those of a robot that tilts.
+        is_remembered = accel_variance < settings.accel_bias_std**2
+        turn_variance = 0.0 if is_remembered else variance / strength**2
         tilt_noise = tilt_noise_at_rest(state, duration, strength, settings)
         if dot(change, change) > 0.0:
             tilt_noise += (0.5 * duration) ** 2 * turn_variance

@@ -124,11 +124,11 @@ def sway_variance(state, first, noise_density):
 def variance_of_half(state):
     """Return the variance ((m/s2)2) of the mean force of half a window, by how its parts scatter: noise, sway, turns.
 
-    It is that of the axis that scatters most; 0 for less than `FEWEST_PARTS`, which do not show it.
+    A few parts show it to a factor of two, which is in it; 0 for less than `FEWEST_PARTS`, which do not show it.
     """
     if state.residual.parts < FEWEST_PARTS:
         return 0.0
-    return sway_variance(state, 0, 0.0) / (0.5 * state.residual.parts)
+    return 2.0 * sway_variance(state, 0, 0.0) / (0.5 * state.residual.parts)
 
 
 @njit
