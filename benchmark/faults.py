@@ -131,7 +131,7 @@ def main() -> int:
     if options.out is not None:
         how = " --quick" * options.quick + f" --generator {options.generator}" * (drives is not None)
         lead = (
-            f"Written by `python benchmark/faults.py{how} --out docs/trust.md`, {seeds} seeds a row; its first lines "
+            f"Written by `python benchmark/faults.py{how} --out {options.out}`, {seeds} seeds a row; its first lines "
             "say how the columns are counted.\n\n"
         )
         replace_section(options.out, "Bars", lead + bars)
