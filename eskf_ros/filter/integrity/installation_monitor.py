@@ -117,10 +117,11 @@ def learn_faults(state, aid, size, gate, work, settings):
     if state.heading_known == 0 or aid.verdict == Verdict.RESET:
         forget_faults(state)
         return
-    if aid.verdict == Verdict.TAKEOVER and state.installation.stamp != NEVER:
+    if aid.verdict == Verdict.TAKEOVER:
         # A wrong lever arm or time offset may be why the filter seemed wrong: the evidence stays. The humble lane has
         # heard the same receivers, and has followed the faults much as the filter has.
-        carry_absorbed(state, settings)
+        if state.installation.stamp != NEVER:
+            carry_absorbed(state, settings)
         return
     if state.covariance[HEADING, HEADING] > LEARNING_HEADING_STD**2:
         # Far from the truth the derivatives are others.
@@ -130,7 +131,7 @@ def learn_faults(state, aid, size, gate, work, settings):
     if state.installation.stamp == NEVER:
         absorb_completely(state, settings)
     dt = carry_absorbed(state, settings)
-    accepted = aid.verdict in (Verdict.FUSED, Verdict.WEIGHED_DOWN, Verdict.TAKEOVER)
+    accepted = aid.verdict in (Verdict.FUSED, Verdict.WEIGHED_DOWN)
     for source in range(SOURCES):
         absorbed = state.installation.absorbed[source]
         write_effect(state, aid, work, settings)

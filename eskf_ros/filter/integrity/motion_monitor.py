@@ -110,8 +110,8 @@ LEAST_PAUSE = 0.3
 PAUSE_SIGMAS = 4.0
 """Standard deviations of the difference of two fixes by which the way during a pause must be too short."""
 
-FEWEST_WAYS = 2
-"""Windows in motion from which on the ways by positions and by velocities are compared."""
+FEWEST_WAYS = 1
+"""Windows in motion after which the ways by positions and by velocities are compared."""
 
 LEAST_WAY = 5.0
 """m; in a window in which the robot has moved less the ways are those of noise."""
@@ -406,5 +406,5 @@ def compare_axes(motion, change):
     motion.axes[1] += (change[0] - way[1]) ** 2 + (change[1] - way[0]) ** 2
     motion.axes[2] += 1.0
     own, exchanged, ways = motion.axes[0], motion.axes[1], motion.axes[2]
-    is_other = ways > FEWEST_WAYS - 0.5 and own > OTHER_WAY * ways and own > BETTER * exchanged
+    is_other = ways > FEWEST_WAYS and own > OTHER_WAY * ways and own > BETTER * exchanged
     motion.has_other_axes = 1 if is_other else 0

@@ -87,7 +87,7 @@ SAME = 0.7
 HELD = 0.7
 """Share of the limits of a lag beyond which it stays once it is known."""
 
-BETTER = 0.02
+BETTER_FIT = 0.02
 """Correlation by which courses must fit the gyro better with a lag: in smooth turns many fit alike."""
 
 NOTABLE_LAG = 0.6
@@ -139,9 +139,9 @@ def lag_of(turns, length):
     if turns.count < FEWEST_TURNS or square * turns.count <= TURNED * turns.weight:
         return 0.0
     gyro_square = turns.gyro_square[2] - turns.gyro[2] ** 2 / turns.weight
-    shown = SAME * math.sqrt(gyro_square * square)
+    full = math.sqrt(gyro_square * square)
     mean = turns.gyro[2] * turns.course / turns.weight
-    reach = 1 if turns.shifted[LAGS] - mean > shown else LAGS
+    reach = 1 if turns.shifted[LAGS] - mean > SAME * full else LAGS
     best = LAGS
     for k in range(LAGS - reach, LAGS + reach + 1):
         if turns.shifted[k] > turns.shifted[best]:
@@ -155,7 +155,7 @@ def lag_of(turns, length):
     # What has been told is held unless the turns speak against it.
     held = HELD if turns.lag * lag > 0.0 else 1.0
     better = same - 0.125 * (after - before) ** 2 / bend - turns.shifted[LAGS]
-    is_shown = max(max(before, after), same - mean) > held * shown and better > held * BETTER / SAME * shown
+    is_shown = max(max(before, after), same - mean) > held * SAME * full and better > held * BETTER_FIT * full
     return lag if abs(lag) > held * NOTABLE_LAG and is_shown else 0.0
 
 

@@ -10,10 +10,10 @@ from eskf_ros.filter.state.error_state import ATTITUDE, GYRO_BIAS
 from eskf_ros.filter.state.time import NEVER
 
 OPENED_TILT_STD = 0.1
-"""rad per axis; of roll and pitch after a fault of the IMU, or of what has corrected them."""
+"""rad per axis; of roll and pitch that are doubted."""
 
 OPENED_GYRO_BIAS_STD = 0.01
-"""rad/s; of the gyro bias after such a fault."""
+"""rad/s; of a gyro bias that is doubted."""
 
 
 @njit
@@ -44,8 +44,14 @@ def reset_to_level(state):
     """Drop all but the level: it is doubted, and the next fix gives the position, the motion after it the heading."""
     reset_to_unknown_heading(state)
     state.position_known = 0
+    open_level(state)
+    forget_faults(state)
+
+
+@njit
+def open_level(state):
+    """Doubt roll, pitch and gyro bias after a fault of the IMU, or of what has corrected them."""
     for i in range(3):
         if i < 2:
             state.covariance[ATTITUDE + i, ATTITUDE + i] += OPENED_TILT_STD**2
         state.covariance[GYRO_BIAS + i, GYRO_BIAS + i] += OPENED_GYRO_BIAS_STD**2
-    forget_faults(state)

@@ -106,17 +106,17 @@ def update_static_window(state, settings):
         for i in range(6):
             state.window.total[i] = 0.0
             state.window.square_total[i] = 0.0
+    duration = (state.stamp - state.window.start) * 1e-9
+    if state.window.half_samples == 0 and 2.0 * duration > settings.static_duration:
+        state.window.half_samples = state.window.samples
+        for i in range(3):
+            state.window.half_force[i] = state.window.total[i]
     for i in range(3):
         state.window.total[i] += state.specific_force[i]
         state.window.square_total[i] += state.specific_force[i] ** 2
         state.window.total[3 + i] += state.angular_rate[i]
         state.window.square_total[3 + i] += state.angular_rate[i] ** 2
     state.window.samples += 1
-    duration = (state.stamp - state.window.start) * 1e-9
-    if 2.0 * duration <= settings.static_duration:
-        state.window.half_samples = state.window.samples
-        for i in range(3):
-            state.window.half_force[i] = state.window.total[i]
     if duration < settings.static_duration or state.window.samples < MINIMUM_WINDOW_SAMPLES:
         return Window.OPEN
     # A creep may be slower than what proves motion at once, and quiet.
