@@ -147,6 +147,20 @@ def test_while_fixes_that_came_back_are_refused_the_covariance_reaches_to_them()
     assert (trace.error[back] < 2.0 * trace.sigma[back]).all()
 
 
+def test_errors_of_fixes_that_wrong_velocities_made_up_are_forgotten_with_them() -> None:
+    """Velocities in other axes are known from 27 s on: the next fixes are the position, not fixes that err by 9 m."""
+    fault = BY_NAME["velocity in north, east, down"]
+    trace = run_one(fault, recording_of(fault, 1), TOLD_VELOCITY)
+    after = (trace.seconds > 28.0) & (trace.seconds < 34.0)
+    assert trace.error[after].max() < 4.0
+
+
+def test_no_turn_is_judged_by_the_second_that_the_constraint_takes() -> None:
+    """A mower begins to turn 70 ms before the end of a second at rest: its mean rate is that of rest."""
+    fault = BY_NAME["mower rows, RTK"]
+    assert figures_of(fault, run_one(fault, recording_of(fault, 0), TOLD_VELOCITY)).false_rest == 0
+
+
 @pytest.mark.parametrize(("apart", "lies"), [(1.2, 0.0), (2.4, 0.03), (4.2, 0.06)])
 def test_clocks_that_are_seconds_apart_are_told_and_allowed_for(apart: float, lies: float) -> None:
     """The course turns as much later as it is stamped, and the position is off by time times speed.

@@ -8,14 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from eskf_ros.filter.integrity.fault_effects import POSITION_TIME, write_effect_on_position
+from eskf_ros.filter.history.records import AID
+from eskf_ros.filter.integrity.fault_effects import POSITION_TIME, VELOCITY_TIME, write_effect_on_position
 from eskf_ros.filter.integrity.fix_errors import update_shares
 from eskf_ros.filter.integrity.heading_monitor import slip_of, watch_slip
-from eskf_ros.filter.integrity.installation_monitor import forget_uncertain_turns
-from eskf_ros.filter.integrity.motion_report import _compared
+from eskf_ros.filter.integrity.installation_monitor import forget_uncertain_turns, learn_faults
+from eskf_ros.filter.integrity.motion_report import _compared, travel_complaints
 from eskf_ros.filter.integrity.motion_sums import add_push, add_turn
+from eskf_ros.filter.state.enums import Stream, Verdict
 from eskf_ros.filter.state.error_state import ATTITUDE, VELOCITY
-from eskf_ros.filter.state.time import SECOND
+from eskf_ros.filter.state.time import NEVER, SECOND
 from support.kernels import make_settings, make_state, make_work
 
 SETTINGS = make_settings()
@@ -148,3 +150,36 @@ def test_slopes_are_no_mounting() -> None:
         matrix, std = compared
         sigmas.append(math.atan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1]) / std)
     assert 0.5 < np.mean(np.square(sigmas)) < 2.0
+
+
+@pytest.mark.parametrize(("windows", "angle_deg", "told"), [(40, 8.0, False), (120, 8.0, True), (40, 90.0, True)])
+def test_a_small_angle_to_the_travel_is_not_told_before_it_is_known_how_errors_last(
+    windows: int, angle_deg: float, told: bool
+) -> None:
+    rng, state = np.random.default_rng(0), make_state()
+    state["motion"]["heard_stamp"] = SECOND
+    angle = math.radians(angle_deg)
+    for _ in range(windows):
+        pull = rng.normal(size=2)
+        x = math.cos(angle) * pull[0] + math.sin(angle) * pull[1]
+        y = math.cos(angle) * pull[1] - math.sin(angle) * pull[0]
+        add_push(state["motion"]["pushes"], (100.0, 0.0), (100.0 + pull[0], pull[1]), (x, y, 9.8), 1.0)
+    texts, _ = travel_complaints(state, SETTINGS, (0.0, 0.0, 0.0))
+    assert bool(texts) == told
+
+
+@pytest.mark.parametrize("stamp", [SECOND, NEVER])
+def test_a_takeover_keeps_what_was_learnt_of_faults_and_what_they_have_done(stamp: int) -> None:
+    """The innovation in the work space is not that of the message any more: nothing is learnt from it."""
+    state, work, aid = make_state(velocity=(10.0, 0.0, 0.0)), make_work(), np.zeros(1, AID)[0]
+    state["stamp"], state["heading_known"], state["error_size"] = SECOND, 1, 15
+    state["installation"]["stamp"] = stamp
+    state["installation"]["absorbed"][0, 0, VELOCITY_TIME] = 5.0
+    state["installation"]["evidence"], state["installation"]["information"] = 1.0, 2.0
+    work["innovation"], work["gain"] = 100.0, 1.0
+    aid["stream"], aid["verdict"] = Stream.GNSS_VELOCITY, Verdict.TAKEOVER
+    learn_faults(state, aid, 3, 16.0, work, SETTINGS)
+    assert state["installation"]["stamp"] == stamp
+    assert state["installation"]["absorbed"][0, 0, VELOCITY_TIME] == 5.0
+    assert (state["installation"]["evidence"] == 1.0).all()
+    assert (state["installation"]["information"] == 2.0).all()

@@ -53,7 +53,7 @@ WRITERS = {
     "inertial/navigation_frame.py": {"reset_attitude", "reset_datum"},
     "inertial/strapdown.py": {"propagate_nominal_state"},
     "integrity/humble_lane.py": {"reset_block", "reset_to_humble_lane", "reset_to_message"},
-    "integrity/restart.py": {"open_level", "reset_alignment", "reset_to_level"},
+    "integrity/restart.py": {"inflate_level", "reset_alignment"},
     "integrity/fix_errors.py": {"inflate_lasting_error", "propagate_walk", "reset_scatter"},
     "measurements/kalman_update.py": {"update_covariance", "update_nominal_state"},
     "measurements/mag.py": {"propagate_mag_error"},

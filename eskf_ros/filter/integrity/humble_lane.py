@@ -35,7 +35,7 @@ from eskf_ros.filter.integrity.refusal import (
     other_stream,
     receiver_of,
 )
-from eskf_ros.filter.integrity.restart import open_level
+from eskf_ros.filter.integrity.restart import inflate_level
 from eskf_ros.filter.measurements import gnss_position, gnss_velocity
 from eskf_ros.filter.measurements.jacobians import clear
 from eskf_ros.filter.measurements.kalman_update import apply, judge, update
@@ -265,7 +265,7 @@ def reset_to_message(lane, trust, aid, is_inertial, work):
             lane.covariance[VELOCITY + i, VELOCITY + i] = OPENED_VELOCITY_STD**2
     if lane.heading_known == 0:
         return
-    open_level(lane)
+    inflate_level(lane)
     lane.covariance[ATTITUDE + 2, ATTITUDE + 2] += OPENED_HEADING_STD**2
 
 

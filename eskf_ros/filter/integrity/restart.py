@@ -44,12 +44,12 @@ def reset_to_level(state):
     """Drop all but the level: it is doubted, and the next fix gives the position, the motion after it the heading."""
     reset_to_unknown_heading(state)
     state.position_known = 0
-    open_level(state)
+    inflate_level(state)
     forget_faults(state)
 
 
 @njit
-def open_level(state):
+def inflate_level(state):
     """Doubt roll, pitch and gyro bias after a fault of the IMU, or of what has corrected them."""
     for i in range(3):
         if i < 2:
