@@ -201,7 +201,8 @@ WORK = np.dtype(
         ("innovation", "f8", (3,)),
         ("noise", "f8", (3, 3)),
         ("effect", "f8", (3, FAULTS)),
-        ("fault_covariance", "f8", (FAULTS, FAULTS)),
+        ("fault_fit", "f8", (FAULTS + 1, FAULTS + 1)),
+        ("is_chosen", "i8", (FAULTS,)),
         ("solution", "f8", (3,)),
         ("solution_covariance", "f8", (3, 3)),
         ("shared", "f8", (3, ERROR_CAPACITY)),
@@ -237,8 +238,8 @@ WORK = np.dtype(
   zero unless the measurement writes it; ``holds_heading``: 1 for GNSS, which shows the heading by accelerations
   alone, and with it the error at ``heading_offset_at``.
 - ``projected`` ... ``correction``: intermediate results of the update.
-- ``effect``, ``fault_covariance``: derivative of the measurement by the faults of its receiver, and the covariance of
-  these (`installation_monitor`).
+- ``effect``: derivative of the measurement by the faults of its receiver; ``fault_fit``, ``is_chosen``: normal
+  equations of these, and the ones that are estimated (`installation_monitor`, `stepwise`).
 - ``solution``, ``solution_covariance``: position or velocity (map) of the antenna from the ranges of one epoch.
 - ``signal_*`` ... ``step``: the signals of one epoch and their least squares.
 """

@@ -21,7 +21,7 @@ from eskf_ros.filter.integrity.fault_effects import (
     write_effect,
 )
 from eskf_ros.filter.integrity.heading_corrections import HEADING
-from eskf_ros.filter.measurements.kalman_update import invert_positive
+from eskf_ros.filter.integrity.stepwise import best_cause, lost_by_exchange, sweep
 from eskf_ros.filter.state.enums import Stream, Verdict
 from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_CAPACITY, ERROR_SIZE, SOURCES
 from eskf_ros.filter.state.time import NEVER, SECOND
@@ -240,53 +240,74 @@ def weigh_faults(state, source, dt, weight, work):
 
 @njit
 def find_faults(state, work):
-    """Solve the normal equations every `CHECK_INTERVAL`, and note which faults are certain.
+    """Estimate the faults every `CHECK_INTERVAL`, and note which are certain.
 
-    Innovations that the faults leave unexplained, and a scatter that is larger than expected, widen the standard
-    deviations, and errors of fixes that last do. A large fault leaks into the estimates of the others.
+    Only faults that the innovations ask for one after the other are estimated, the others are zero (`stepwise`): a
+    lever arm, a time offset and a scale explain the same in smooth motion. Innovations that the faults leave
+    unexplained, and a scatter that is larger than expected, widen the standard deviations, and errors of fixes that
+    last do. A fault is certain where neither none nor another in its place explains nearly as much. A large fault
+    leaks into the estimates of the others.
     """
     if state.stamp - state.installation.checked < CHECK_INTERVAL:
         return
     state.installation.checked = state.stamp
+    fit, is_chosen = work.fault_fit, work.is_chosen
     for source in range(SOURCES):
-        excess = max(1.0, max(state.scatter.velocity[source], state.scatter.spread[source]))
-        together = fixes_together(state, source)
-        covariance = work.fault_covariance
+        write_normal_equations(state, source, fit)
+        choose_faults(state, source, fit, is_chosen)
+        largest, unexplained = 0.0, fit[FAULTS, FAULTS]
+        widest = widening(state, source, 0, unexplained)
         for k in range(FAULTS):
+            variance = fit[k, k] if is_chosen[k] else 1.0 / fit[k, k]
+            state.installation.estimate[source, k] = fit[k, FAULTS] if is_chosen[k] else 0.0
+            state.installation.sigma[source, k] = math.sqrt(variance * widening(state, source, k, unexplained))
             for m in range(FAULTS):
-                covariance[k, m] = state.installation.information[source, k, m]
-            covariance[k, k] += 1.0 / FAULT_PRIOR[k] ** 2
-        if invert_positive(covariance, FAULTS) == 0.0:
-            continue
-        excess = max(excess, unexplained(state, source, covariance))
-        largest = 0.0
+                covariance = fit[k, m] * widest if is_chosen[k] and is_chosen[m] else 0.0
+                state.installation.covariance[source, k, m] = covariance
+            largest = max(largest, abs(state.installation.estimate[source, k]) / state.installation.sigma[source, k])
         for k in range(FAULTS):
-            estimate = 0.0
-            for m in range(FAULTS):
-                estimate += covariance[k, m] * state.installation.evidence[source, m]
-            state.installation.estimate[source, k] = state.installation.found[source, k] = estimate
-            widening = excess if k == VELOCITY_TIME else excess + together
-            state.installation.sigma[source, k] = math.sqrt(covariance[k, k] * widening)
-            for m in range(FAULTS):
-                state.installation.covariance[source, k, m] = covariance[k, m] * (excess + together)
-            largest = max(largest, abs(estimate) / state.installation.sigma[source, k])
-        for k in range(FAULTS):
-            estimate, sigma = state.installation.found[source, k], state.installation.sigma[source, k]
+            estimate, sigma = state.installation.estimate[source, k], state.installation.sigma[source, k]
             is_small = abs(estimate) < max(FAULT_SIGMAS, LEAKAGE * largest) * sigma or abs(estimate) < LEAST_FAULT[k]
-            if is_small or abs(estimate) > LARGEST_FAULT * FAULT_PRIOR[k]:
-                state.installation.found[source, k] = 0.0
-            is_certain = state.installation.found[source, k] != 0.0
+            is_certain = is_chosen[k] and not is_small and abs(estimate) < LARGEST_FAULT * FAULT_PRIOR[k]
+            if is_certain:
+                least = FAULT_SIGMAS**2 * widening(state, source, k, unexplained)
+                is_certain = lost_by_exchange(fit, is_chosen, k) > least
+            state.installation.found[source, k] = estimate if is_certain else 0.0
             state.installation.held[source, k] = state.installation.held[source, k] + 1 if is_certain else 0
 
 
 @njit
-def unexplained(state, source, covariance):
-    """Return the NIS per degree of freedom that the faults, of a ``covariance`` (7, 7), leave unexplained."""
-    evidence, explained = state.installation.evidence[source], 0.0
+def write_normal_equations(state, source, fit):
+    """Write the normal equations of the faults of a receiver, with their priors, as `stepwise` wants them."""
     for k in range(FAULTS):
         for m in range(FAULTS):
-            explained += evidence[k] * covariance[k, m] * evidence[m]
-    return (state.installation.misfit[source, 0] - explained) / max(state.installation.misfit[source, 1], 1.0)
+            fit[k, m] = state.installation.information[source, k, m]
+        fit[k, k] += 1.0 / FAULT_PRIOR[k] ** 2
+        fit[k, FAULTS] = fit[FAULTS, k] = state.installation.evidence[source, k]
+    fit[FAULTS, FAULTS] = state.installation.misfit[source, 0]
+
+
+@njit
+def choose_faults(state, source, fit, is_chosen):
+    """Choose the faults one after the other, the one that explains most first, while one is not chance."""
+    is_chosen.fill(0)
+    while True:
+        best, most = best_cause(fit, is_chosen)
+        if best < 0 or most < CONSIDERED_SIGMAS**2 * widening(state, source, best, fit[FAULTS, FAULTS] - most):
+            return
+        sweep(fit, best)
+        is_chosen[best] = 1
+
+
+@njit
+def widening(state, source, fault, unexplained):
+    """Return the ratio of the variance of an estimated fault to that of the normal equations.
+
+    ``unexplained``: the part of the sum of NIS that the faults leave.
+    """
+    excess = max(1.0, max(state.scatter.velocity[source], state.scatter.spread[source]))
+    excess = max(excess, unexplained / max(state.installation.misfit[source, 1], 1.0))
+    return excess if fault == VELOCITY_TIME else excess + fixes_together(state, source)
 
 
 @njit
