@@ -24,6 +24,7 @@ from eskf_ros.filter.inertial.strapdown import IMU_READINGS
 from eskf_ros.filter.integrity.fault_effects import FAULTS
 from eskf_ros.filter.integrity.heading_corrections import CORRECTIONS
 from eskf_ros.filter.integrity.heading_monitor import HEADING_MONITOR
+from eskf_ros.filter.integrity.heading_trial import TRIAL
 from eskf_ros.filter.integrity.humble_lane import TRUST
 from eskf_ros.filter.integrity.imu_monitor import IMU_MONITOR
 from eskf_ros.filter.integrity.installation_monitor import INSTALLATION
@@ -104,6 +105,7 @@ STATE = np.dtype(
         ("heading_monitor", HEADING_MONITOR),
         ("recovery", RECOVERY),
         ("trust", TRUST),
+        ("trial", TRIAL),
         ("corrections", CORRECTIONS),
         ("receiver", RECEIVER_MONITOR),
         ("installation", INSTALLATION),
@@ -260,6 +262,7 @@ _NEVER = {
         "reset_stamp",
     ),
     "trust": ("doubt_stamp",),
+    "trial": ("given_stamp", "moved", "found"),
     "corrections": ("since",),
     "scatter": ("last_stamp", "walk_stamp"),
     "installation": ("stamp", "checked"),

@@ -106,8 +106,11 @@ def test_fixes_that_hardly_change_are_calm_however_little_they_walk() -> None:
     assert state["scatter"]["calm"][0] >= 0.95
 
 
-def turned(rate_of: Any, lag: float, seed: int) -> list[float]:
-    """The lags (s) told in 200 s of turns at ``rate_of`` (s) -> rad/s, with a receiver stamped ``lag`` later."""
+def turned(rate_of: Any, lag: float, seed: int, bias: float = 0.0) -> list[float]:
+    """The lags (s) told in 200 s of turns at ``rate_of`` (s) -> rad/s, with a receiver stamped ``lag`` later.
+
+    The gyro has a ``bias`` (rad/s).
+    """
     rng, turns = np.random.default_rng(seed), make_state()["motion"]["turns"]
     seconds = np.arange(0.0, 201.0, 0.01)
     turn = np.concatenate([[0.0], np.cumsum(rate_of(seconds[:-1]) * 0.01)])
@@ -116,7 +119,7 @@ def turned(rate_of: Any, lag: float, seed: int) -> list[float]:
         course = np.interp([k - 1.0 - lag, k - lag], seconds, turn) + 0.005 * rng.normal(size=2)
         gyro = float(np.interp(k, seconds, turn) - np.interp(k - 1.0, seconds, turn))
         before, after = ((10.0 * math.cos(angle), 10.0 * math.sin(angle)) for angle in course)
-        add_turn(turns, before, after, (0.0, 0.0, gyro), 2.0 * 0.005**2, (k - 1) * SECOND, 1.0)
+        add_turn(turns, before, after, (0.0, 0.0, gyro + bias), 2.0 * 0.005**2, (k - 1) * SECOND, 1.0)
         told.append(float(turns["lag"]))
     return told
 
@@ -125,6 +128,13 @@ def turned(rate_of: Any, lag: float, seed: int) -> list[float]:
 def test_smooth_turns_are_no_sign_of_clocks_that_are_apart(period: float) -> None:
     for seed in range(10):
         assert not any(turned(lambda t: 0.25 * np.sin(2.0 * np.pi * t / period), 0.0, seed)), seed
+
+
+@pytest.mark.parametrize("period", [20.0, 60.0])
+@pytest.mark.parametrize("lag", [-2.4, 1.2])
+def test_smooth_turns_show_clocks_that_are_apart(period: float, lag: float) -> None:
+    told = turned(lambda t: 0.25 * np.sin(2.0 * np.pi * t / period), lag, 0, bias=math.radians(0.5))
+    assert told[60:] == [pytest.approx(lag, abs=0.15)] * len(told[60:])
 
 
 @pytest.mark.parametrize("lag", [-3.6, -1.2, 1.2, 2.4, 4.2])

@@ -185,7 +185,8 @@ def reset_given_heading(state, aid, settings, work):
 @njit
 def confirm_given_heading(state):
     """Count a fused message of GNSS for the heading that was given, while accelerations show the heading."""
-    if state.heading.given_stamp == NEVER or state.heading_known == 0 or state.excitation.left == 0.0:
+    is_asked = state.heading.given_stamp != NEVER and state.trial.is_on == 0
+    if not is_asked or state.heading_known == 0 or state.excitation.left == 0.0:
         return
     if state.heading.tried_stamp != state.heading.given_stamp:
         state.heading.tried_stamp = state.heading.given_stamp

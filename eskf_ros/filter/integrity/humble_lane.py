@@ -127,6 +127,8 @@ def start(states, settings):
     if state.heading_known == 0 or state.position_known == 0 or settings.has_humble_lane == 0:
         humble.heading_known = 0
         return
+    if state.trial.is_on == 1:
+        return
     if is_running(states) and humble.covariance[ATTITUDE + 2, ATTITUDE + 2] < LOST_HEADING_STD**2:
         return
     states[HUMBLE] = states[FILTER]
@@ -328,22 +330,7 @@ def reset_to_humble_lane(states, is_bias_wrong, work):
     accel_bias, gyro_bias = (accel[0], accel[1], accel[2]), (gyro[0], gyro[1], gyro[2])
     accel_variance = variances(state.covariance, ACCEL_BIAS)
     gyro_variance = variances(state.covariance, GYRO_BIAS)
-    for i in range(3):
-        state.position_map[i] = humble.position_map[i]
-        state.velocity_map[i] = humble.velocity_map[i]
-        state.accel_bias[i] = humble.accel_bias[i]
-        state.gyro_bias[i] = humble.gyro_bias[i]
-    for i in range(4):
-        state.attitude[i] = humble.attitude[i]
-    size = humble.error_size
-    for i in range(size - ERROR_SIZE):
-        state.optional[i] = humble.optional[i]
-    for i in range(size):
-        for j in range(size):
-            state.covariance[i, j] = humble.covariance[i, j]
-        for j in range(size, state.error_size):
-            state.covariance[i, j] = 0.0
-            state.covariance[j, i] = 0.0
+    continue_from_lane(state, humble)
     trust = state.trust
     passed = (state.stamp - trust.doubt_stamp) * 1e-9 if trust.doubt_stamp != NEVER else math.inf
     is_first = passed >= FIRST_DOUBT
@@ -360,6 +347,27 @@ def reset_to_humble_lane(states, is_bias_wrong, work):
         keeps_accel = keep_bias(state, ACCEL_BIAS, accel_bias, accel_variance, work)
         keeps_gyro = keep_bias(state, GYRO_BIAS, gyro_bias, gyro_variance, work)
         state.bias_doubt = 0.0 if keeps_accel and keeps_gyro else 1.0
+
+
+@njit
+def continue_from_lane(state, lane):
+    """Take the estimate of a lane and its covariance; errors that it does not have keep theirs, uncorrelated."""
+    for i in range(3):
+        state.position_map[i] = lane.position_map[i]
+        state.velocity_map[i] = lane.velocity_map[i]
+        state.accel_bias[i] = lane.accel_bias[i]
+        state.gyro_bias[i] = lane.gyro_bias[i]
+    for i in range(4):
+        state.attitude[i] = lane.attitude[i]
+    size = lane.error_size
+    for i in range(size - ERROR_SIZE):
+        state.optional[i] = lane.optional[i]
+    for i in range(size):
+        for j in range(size):
+            state.covariance[i, j] = lane.covariance[i, j]
+        for j in range(size, state.error_size):
+            state.covariance[i, j] = 0.0
+            state.covariance[j, i] = 0.0
 
 
 @njit

@@ -21,8 +21,8 @@ TURNS = np.dtype(
         ("gyro", "f8", (3,)),
         ("gyro_square", "f8", (3,)),
         ("product", "f8", (3,)),
-        ("shifted", "f8", (2 * LAGS + 1,)),
-        ("recent", "f8", (LAGS, 2)),
+        ("shifted", "f8", (2 * LAGS + 1, 5)),
+        ("recent", "f8", (LAGS, 3)),
         ("recent_count", "i8"),
         ("last_stamp", "i8"),
         ("lag", "f8"),
@@ -31,10 +31,11 @@ TURNS = np.dtype(
 )
 """Sums over windows of the change of course and the integrated rates (rad, axes of base_link), weighted (1/rad2).
 
-``shifted``: products of the course with the rate about z of the window that is k windows earlier, at `LAGS` + k.
-``recent``, ``recent_count``, ``last_stamp``: rate about z and course of the windows before this one, the newest first;
-how many of them follow each other without a hole; the end of the newest (ns). ``lag``: by how much the receiver is
-stamped later than the IMU (s); 0 where it is less than notable, or not known.
+``shifted``: at `LAGS` + k, of the windows whose course is compared with the rate about z of k windows earlier: the sum
+of the weights, of the weighed differences and of their squares, and the last two for the rate of the same window.
+``recent``, ``recent_count``, ``last_stamp``: rate about z, course and weight of the windows before this one, the newest
+first; how many of them follow each other without a hole; the end of the newest (ns). ``lag``: by how much the receiver
+is stamped later than the IMU (s); 0 where it is less than notable, or not known.
 """
 
 PUSHES = np.dtype(
@@ -87,8 +88,8 @@ SAME = 0.7
 HELD = 0.7
 """Share of the limits of a lag beyond which it stays once it is known."""
 
-BETTER_FIT = 0.02
-"""Correlation by which courses must fit the gyro better with a lag: in smooth turns many fit alike."""
+LAG_SIGMAS = 5.0
+"""Standard deviations of a lag from which on it is certain."""
 
 NOTABLE_LAG = 0.6
 """s; a time between course and gyro from which on it is told: less is found by the installation monitor."""
@@ -111,14 +112,17 @@ def add_turn(turns, before, after, turn, variance, start, passed):
     if start != turns.last_stamp:
         turns.recent_count = 0
     for k in range(2 * LAGS + 1):
-        turns.shifted[k] *= remains
-    turns.shifted[LAGS] += weight * turn[2] * course
+        for i in range(5):
+            turns.shifted[k, i] *= remains
+    add_shifted(turns.shifted[LAGS], weight, course, turn[2], turn[2])
     for k in range(min(turns.recent_count, LAGS)):
-        turns.shifted[LAGS + 1 + k] += weight * course * turns.recent[k, 0]
-        turns.shifted[LAGS - 1 - k] += weight * turn[2] * turns.recent[k, 1]
+        earlier = turns.recent[k]
+        add_shifted(turns.shifted[LAGS + 1 + k], weight, course, earlier[0], turn[2])
+        add_shifted(turns.shifted[LAGS - 1 - k], earlier[2], earlier[1], turn[2], earlier[0])
     for k in range(LAGS - 1, 0, -1):
-        turns.recent[k, 0], turns.recent[k, 1] = turns.recent[k - 1, 0], turns.recent[k - 1, 1]
-    turns.recent[0, 0], turns.recent[0, 1] = turn[2], course
+        for i in range(3):
+            turns.recent[k, i] = turns.recent[k - 1, i]
+    turns.recent[0, 0], turns.recent[0, 1], turns.recent[0, 2] = turn[2], course, weight
     turns.recent_count += 1
     turns.last_stamp = start + round(passed * 1e9)
     for i in range(3):
@@ -129,33 +133,58 @@ def add_turn(turns, before, after, turn, variance, start, passed):
 
 
 @njit
-def lag_of(turns, length):
-    """Return by how much (s) the course is stamped later than the gyro: the top of the parabola through the products.
+def add_shifted(sums, weight, course, shifted, same):
+    """Add what the course is from the rate of a shifted window, and of the same one (rad)."""
+    sums[0] += weight
+    sums[1] += weight * (course - shifted)
+    sums[2] += weight * (course - shifted) ** 2
+    sums[3] += weight * (course - same)
+    sums[4] += weight * (course - same) ** 2
 
-    They are those of the course with the gyro of windows (of a ``length`` in s) before, of the same, and after. Turns
-    that come at regular times show again and again: what is far off is asked only where the same windows show nothing.
+
+@njit
+def left_with_lag(sums):
+    """Return the sum of squares that a lag leaves unexplained; the bias of the gyro is the mean of the differences."""
+    return sums[2] - sums[1] ** 2 / max(sums[0], 1e-12)
+
+
+@njit
+def gain_by_lag(sums):
+    """Return by how much less a lag leaves unexplained than none does, of the same windows."""
+    return sums[4] - sums[3] ** 2 / max(sums[0], 1e-12) - left_with_lag(sums)
+
+
+@njit
+def lag_of(turns, length):
+    """Return by how much (s) the course is stamped later than the gyro: the lag that leaves least unexplained.
+
+    Between the lags of whole windows (of a ``length`` in s) it is the top of a parabola.
     """
     square = turns.course_square - turns.course**2 / turns.weight
-    if turns.count < FEWEST_TURNS or square * turns.count <= TURNED * turns.weight:
+    if turns.count < FEWEST_TURNS:
         return 0.0
-    gyro_square = turns.gyro_square[2] - turns.gyro[2] ** 2 / turns.weight
-    full = math.sqrt(gyro_square * square)
-    mean = turns.gyro[2] * turns.course / turns.weight
-    reach = 1 if turns.shifted[LAGS] - mean > SAME * full else LAGS
-    best = LAGS
-    for k in range(LAGS - reach, LAGS + reach + 1):
-        if turns.shifted[k] > turns.shifted[best]:
+    best = 1
+    for k in range(2, 2 * LAGS):
+        if gain_by_lag(turns.shifted[k]) > gain_by_lag(turns.shifted[best]):
             best = k
-    best = min(max(best, 1), 2 * LAGS - 1)
-    after, same, before = turns.shifted[best - 1], turns.shifted[best], turns.shifted[best + 1]
-    bend = before - 2.0 * same + after
-    if same + before + after <= 0.0 or bend >= 0.0:
+    earlier, same, later = (
+        gain_by_lag(turns.shifted[best - 1]),
+        gain_by_lag(turns.shifted[best]),
+        gain_by_lag(turns.shifted[best + 1]),
+    )
+    bend = earlier - 2.0 * same + later
+    if bend >= 0.0:
         return 0.0
-    lag = (best - LAGS + 0.5 * (after - before) / bend) * length
+    shift = min(max(0.5 * (earlier - later) / bend, -0.5), 0.5)
+    peak = same - 0.25 * (earlier - later) * shift
+    sums = turns.shifted[best]
+    # What one window leaves, with noise as it was expected 1, and the share of its course that it leaves.
+    left = (sums[4] - sums[3] ** 2 / max(sums[0], 1e-12) - peak) / max(sums[0], 1e-12)
+    chance = max(1.0, left * turns.weight / turns.count)
     # What has been told is held unless the turns speak against it.
+    lag = (best - LAGS + shift) * length
     held = HELD if turns.lag * lag > 0.0 else 1.0
-    better = same - 0.125 * (after - before) ** 2 / bend - turns.shifted[LAGS]
-    is_shown = max(max(before, after), same - mean) > held * SAME * full and better > held * BETTER_FIT * full
+    is_shown = held * left * turns.weight < (1.0 - SAME**2) * square and peak > held * LAG_SIGMAS**2 * chance
     return lag if abs(lag) > held * NOTABLE_LAG and is_shown else 0.0
 
 

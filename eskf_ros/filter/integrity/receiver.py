@@ -23,6 +23,7 @@ from eskf_ros.filter.integrity.fix_errors import (
     update_shares,
 )
 from eskf_ros.filter.integrity.heading_corrections import HEADING, forget_corrections, weigh_correction
+from eskf_ros.filter.integrity.heading_trial import continue_without_given_heading, is_refuted, update_trial
 from eskf_ros.filter.integrity.humble_lane import (
     hear,
     linearize,
@@ -49,7 +50,7 @@ from eskf_ros.filter.integrity.scatter import (
 )
 from eskf_ros.filter.measurements.kalman_update import apply, judge, project, update
 from eskf_ros.filter.state.enums import Stream, Verdict
-from eskf_ros.filter.state.lanes import FILTER, HUMBLE, is_running
+from eskf_ros.filter.state.lanes import FILTER, HUMBLE, is_judging
 from eskf_ros.filter.state.streams import is_live
 from eskf_ros.filter.state.time import NEVER
 
@@ -88,10 +89,12 @@ def fuse_receiver(states, aid, gate, settings, work):
     ):
         # A gyro that did not measure has left no heading that a linear filter could correct: it is searched for.
         reset_to_unknown_heading(state)
+    update_trial(states, settings)
     start(states, settings)
     is_position = aid.stream == Stream.GNSS_POSITION
     if is_position:
         propagate_walk(state, state, aid.source)
+    is_wrong_heading = is_refuted(states, aid, gate, settings, work)
     heard, jumps, believed, humble_nis, humble_log = judge_with_humble_lane(states, aid, gate, settings, work)
     size = linearize(state, aid, settings, work)
     if is_position:
@@ -131,6 +134,9 @@ def fuse_receiver(states, aid, gate, settings, work):
     if believed:
         aid.verdict = Verdict.RESET
         note_reset(state)
+    if is_wrong_heading:
+        continue_without_given_heading(states)
+        aid.verdict = Verdict.TAKEOVER
     if aid.verdict in (Verdict.RESET, Verdict.TAKEOVER):
         forget_corrections(state)
         forget_spread(state, humble, settings)
@@ -147,7 +153,7 @@ def judge_with_humble_lane(states, aid, gate, settings, work):
     Returns whether the lane has heard it, and what `hear` returns.
     """
     state, humble = states[FILTER], states[HUMBLE]
-    if not is_running(states):
+    if not is_judging(states):
         return False, False, 0, 0.0, 0.0
     is_position = aid.stream == Stream.GNSS_POSITION
     if is_position:

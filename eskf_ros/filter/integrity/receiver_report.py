@@ -25,7 +25,7 @@ from eskf_ros.filter.state.error_state import SOURCES
 SCATTERED_VELOCITY = 3.0
 """Mean square of the velocities about the humble lane, over their variance, from which on they claim too much."""
 
-DOUBTFUL_SIGMAS = 15.0
+DOUBTFUL_SIGMAS = 25.0
 """Standard deviations beyond which a fault of the installation is reported although IMU or fixes are at fault, too."""
 
 IMPLAUSIBLE, IMPLAUSIBLE_SIGMAS = 2.0, 7.0

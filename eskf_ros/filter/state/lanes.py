@@ -20,10 +20,17 @@ LANES = 2
 
 @njit
 def is_running(states):
-    """Say whether the humble lane runs: it has started from the filter since the heading of that was set last."""
+    """Say whether the humble lane runs: to judge the filter, or without the heading of that, which is on trial."""
+    return is_judging(states) or (states[FILTER].heading_known == 1 and states[FILTER].trial.is_on == 1)
+
+
+@njit
+def is_judging(states):
+    """Say whether the humble lane judges the filter: it has started since the heading of that was set last."""
     state, humble = states[FILTER], states[HUMBLE]
     return (
         state.heading_known == 1
+        and state.trial.is_on == 0
         and humble.heading_known == 1
         and humble.restarts == state.restarts
         and humble.heading.given_stamp == state.heading.given_stamp

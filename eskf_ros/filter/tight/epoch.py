@@ -34,7 +34,7 @@ from eskf_ros.filter.measurements.kalman_update import judge, update
 from eskf_ros.filter.output.local_odometry import note_jump
 from eskf_ros.filter.state.enums import Stream, Verdict
 from eskf_ros.filter.state.error_state import POSITION, VELOCITY
-from eskf_ros.filter.state.lanes import FILTER, HUMBLE, is_running
+from eskf_ros.filter.state.lanes import FILTER, HUMBLE, is_judging
 from eskf_ros.filter.stationarity.detector import note_seen
 from eskf_ros.filter.stationarity.seen_motion import see_velocity
 from eskf_ros.filter.stationarity.static_window import (
@@ -254,7 +254,7 @@ def hear_solution(states, aid, which, settings, work):
     the signals.
     """
     start_humble_lane(states, settings)
-    if not is_running(states):
+    if not is_judging(states):
         return False
     state = states[FILTER]
     size = linearize_solution(state, aid, settings, work)
