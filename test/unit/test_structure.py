@@ -52,7 +52,7 @@ WRITERS = {
     "inertial/covariance.py": {"propagate_noise", "propagate_axis_noise", "propagate_covariance", "update_error_axes"},
     "inertial/navigation_frame.py": {"reset_attitude", "reset_datum"},
     "inertial/strapdown.py": {"propagate_nominal_state"},
-    "integrity/humble_lane.py": {"reset_block", "reset_to_humble_lane", "reset_to_message"},
+    "integrity/humble_lane.py": {"reset_block", "reset_to_lane", "reset_to_message"},
     "integrity/restart.py": {"inflate_level", "reset_alignment"},
     "integrity/fix_errors.py": {"inflate_lasting_error", "propagate_walk", "reset_scatter"},
     "measurements/kalman_update.py": {"update_covariance", "update_nominal_state"},

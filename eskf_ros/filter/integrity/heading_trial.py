@@ -16,7 +16,7 @@ from eskf_ros.filter.alignment.heading_search import note_level
 from eskf_ros.filter.alignment.heading_sensors import reset_to_unknown_heading
 from eskf_ros.filter.inertial.navigation_frame import heading_of
 from eskf_ros.filter.integrity.heading_corrections import HEADING
-from eskf_ros.filter.integrity.humble_lane import continue_from_lane, linearize
+from eskf_ros.filter.integrity.humble_lane import linearize, reset_to_lane
 from eskf_ros.filter.integrity.installation_monitor import forget_faults
 from eskf_ros.filter.measurements.kalman_update import update
 from eskf_ros.filter.state.enums import Stream, Verdict
@@ -91,7 +91,7 @@ def start_without_heading(states, settings):
 
 
 @njit
-def is_refuted(states, aid, gate, settings, work):
+def refute_heading(states, aid, gate, settings, work):
     """Let the lane without the heading hear a message of GNSS; say whether it has found quite another one."""
     state, lane = states[FILTER], states[HUMBLE]
     if state.trial.is_on == 0:
@@ -110,9 +110,9 @@ def is_refuted(states, aid, gate, settings, work):
 
 
 @njit
-def continue_without_given_heading(states):
+def reset_to_found_heading(states):
     """Continue the filter from the lane without the heading that was given."""
-    continue_from_lane(states[FILTER], states[HUMBLE])
+    reset_to_lane(states[FILTER], states[HUMBLE])
     states[FILTER].heading.given_stamp = NEVER
     states[FILTER].trust.refused.fill(0)
     forget_faults(states[FILTER])

@@ -330,7 +330,7 @@ def reset_to_humble_lane(states, is_bias_wrong, work):
     accel_bias, gyro_bias = (accel[0], accel[1], accel[2]), (gyro[0], gyro[1], gyro[2])
     accel_variance = variances(state.covariance, ACCEL_BIAS)
     gyro_variance = variances(state.covariance, GYRO_BIAS)
-    continue_from_lane(state, humble)
+    reset_to_lane(state, humble)
     trust = state.trust
     passed = (state.stamp - trust.doubt_stamp) * 1e-9 if trust.doubt_stamp != NEVER else math.inf
     is_first = passed >= FIRST_DOUBT
@@ -350,7 +350,7 @@ def reset_to_humble_lane(states, is_bias_wrong, work):
 
 
 @njit
-def continue_from_lane(state, lane):
+def reset_to_lane(state, lane):
     """Take the estimate of a lane and its covariance; errors that it does not have keep theirs, uncorrelated."""
     for i in range(3):
         state.position_map[i] = lane.position_map[i]

@@ -86,6 +86,7 @@ INSTALLATION = np.dtype(
         ("information", "f8", (SOURCES, FAULTS, FAULTS)),
         ("evidence", "f8", (SOURCES, FAULTS)),
         ("misfit", "f8", (SOURCES, 2)),
+        ("unexplained", "f8", (SOURCES,)),
         ("checked", "i8"),
         ("estimate", "f8", (SOURCES, FAULTS)),
         ("found", "f8", (SOURCES, FAULTS)),
@@ -102,7 +103,7 @@ INSTALLATION = np.dtype(
 - ``stamp``, ``force``: stamp (ns) and specific force (m/s2, map) of its last step.
 - ``absorbed``: derivative of the errors, augmented states included, by the faults.
 - ``information``, ``evidence``: normal equations of the faults. ``misfit``: sum of the NIS that they are to explain,
-  and of its degrees of freedom.
+  and of its degrees of freedom; ``unexplained``: the part of this sum that they leave.
 - ``checked``: when they were solved last (ns).
 - ``estimate``, ``covariance``, ``sigma``: the faults, true minus configured, their covariance and standard deviations.
 - ``found``: those that are certain, else 0; ``held``: for how many looks in a row they have been so.
@@ -256,6 +257,7 @@ def find_faults(state, work):
         write_normal_equations(state, source, fit)
         choose_faults(state, source, fit, is_chosen)
         largest, unexplained = 0.0, fit[FAULTS, FAULTS]
+        state.installation.unexplained[source] = unexplained
         widest = widening(state, source, 0, unexplained)
         for k in range(FAULTS):
             variance = fit[k, k] if is_chosen[k] else 1.0 / fit[k, k]
@@ -289,24 +291,33 @@ def write_normal_equations(state, source, fit):
 
 @njit
 def choose_faults(state, source, fit, is_chosen):
-    """Choose the faults one after the other, the one that explains most first, while one is not chance."""
+    """Choose the faults one after the other, the one that explains most first, while one is not chance.
+
+    Errors of fixes that last do not count here: a fault that is not chosen counts as zero, which they do not show.
+    """
     is_chosen.fill(0)
     while True:
         best, most = best_cause(fit, is_chosen)
-        if best < 0 or most < CONSIDERED_SIGMAS**2 * widening(state, source, best, fit[FAULTS, FAULTS] - most):
+        if best < 0 or most < CONSIDERED_SIGMAS**2 * excess_of(state, source, fit[FAULTS, FAULTS] - most):
             return
         sweep(fit, best)
         is_chosen[best] = 1
 
 
 @njit
-def widening(state, source, fault, unexplained):
-    """Return the ratio of the variance of an estimated fault to that of the normal equations.
+def excess_of(state, source, unexplained):
+    """Return the ratio of the scatter of the innovations to what is expected, at least 1.
 
     ``unexplained``: the part of the sum of NIS that the faults leave.
     """
     excess = max(1.0, max(state.scatter.velocity[source], state.scatter.spread[source]))
-    excess = max(excess, unexplained / max(state.installation.misfit[source, 1], 1.0))
+    return max(excess, unexplained / max(state.installation.misfit[source, 1], 1.0))
+
+
+@njit
+def widening(state, source, fault, unexplained):
+    """Return the ratio of the variance of an estimated fault to that of the normal equations."""
+    excess = excess_of(state, source, unexplained)
     return excess if fault == VELOCITY_TIME else excess + fixes_together(state, source)
 
 

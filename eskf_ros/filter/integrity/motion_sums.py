@@ -21,7 +21,7 @@ TURNS = np.dtype(
         ("gyro", "f8", (3,)),
         ("gyro_square", "f8", (3,)),
         ("product", "f8", (3,)),
-        ("shifted", "f8", (2 * LAGS + 1, 5)),
+        ("shifted", "f8", (2 * LAGS, 5, 3)),
         ("recent", "f8", (LAGS, 3)),
         ("recent_count", "i8"),
         ("last_stamp", "i8"),
@@ -31,8 +31,9 @@ TURNS = np.dtype(
 )
 """Sums over windows of the change of course and the integrated rates (rad, axes of base_link), weighted (1/rad2).
 
-``shifted``: at `LAGS` + k, of the windows whose course is compared with the rate about z of k windows earlier: the sum
-of the weights, of the weighed differences and of their squares, and the last two for the rate of the same window.
+``shifted``: at `LAGS` + k, of the windows whose course is compared with the rates about z of k and of k + 1 windows
+earlier and of the same window: the products of these three differences (rows 0 to 2), their sums (row 3), and
+those of the weights (row 4).
 ``recent``, ``recent_count``, ``last_stamp``: rate about z, course and weight of the windows before this one, the newest
 first; how many of them follow each other without a hole; the end of the newest (ns). ``lag``: by how much the receiver
 is stamped later than the IMU (s); 0 where it is less than notable, or not known.
@@ -88,7 +89,7 @@ SAME = 0.7
 HELD = 0.7
 """Share of the limits of a lag beyond which it stays once it is known."""
 
-LAG_SIGMAS = 5.0
+LAG_SIGMAS = 4.0
 """Standard deviations of a lag from which on it is certain."""
 
 NOTABLE_LAG = 0.6
@@ -111,14 +112,17 @@ def add_turn(turns, before, after, turn, variance, start, passed):
     turns.course_square = remains * turns.course_square + weight * course * course
     if start != turns.last_stamp:
         turns.recent_count = 0
-    for k in range(2 * LAGS + 1):
+    for k in range(2 * LAGS):
         for i in range(5):
-            turns.shifted[k, i] *= remains
-    add_shifted(turns.shifted[LAGS], weight, course, turn[2], turn[2])
+            for j in range(3):
+                turns.shifted[k, i, j] *= remains
     for k in range(min(turns.recent_count, LAGS)):
-        earlier = turns.recent[k]
-        add_shifted(turns.shifted[LAGS + 1 + k], weight, course, earlier[0], turn[2])
-        add_shifted(turns.shifted[LAGS - 1 - k], earlier[2], earlier[1], turn[2], earlier[0])
+        near = turn[2] if k == 0 else turns.recent[k - 1, 0]
+        differences = (course - near, course - turns.recent[k, 0], course - turn[2])
+        add_shifted(turns.shifted[LAGS + k], weight, differences)
+        rate, before, weight_before = turns.recent[k]
+        differences = (before - turn[2], before - turns.recent[0, 0], before - rate)
+        add_shifted(turns.shifted[LAGS - 1 - k], weight_before, differences)
     for k in range(LAGS - 1, 0, -1):
         for i in range(3):
             turns.recent[k, i] = turns.recent[k - 1, i]
@@ -133,59 +137,48 @@ def add_turn(turns, before, after, turn, variance, start, passed):
 
 
 @njit
-def add_shifted(sums, weight, course, shifted, same):
-    """Add what the course is from the rate of a shifted window, and of the same one (rad)."""
-    sums[0] += weight
-    sums[1] += weight * (course - shifted)
-    sums[2] += weight * (course - shifted) ** 2
-    sums[3] += weight * (course - same)
-    sums[4] += weight * (course - same) ** 2
-
-
-@njit
-def left_with_lag(sums):
-    """Return the sum of squares that a lag leaves unexplained; the bias of the gyro is the mean of the differences."""
-    return sums[2] - sums[1] ** 2 / max(sums[0], 1e-12)
-
-
-@njit
-def gain_by_lag(sums):
-    """Return by how much less a lag leaves unexplained than none does, of the same windows."""
-    return sums[4] - sums[3] ** 2 / max(sums[0], 1e-12) - left_with_lag(sums)
+def add_shifted(sums, weight, differences):
+    """Add three differences (rad) of a course from rates to ``sums`` (5, 3): see `TURNS`."""
+    for i in range(3):
+        for j in range(3):
+            sums[i, j] += weight * differences[i] * differences[j]
+        sums[3, i] += weight * differences[i]
+        sums[4, i] += weight
 
 
 @njit
 def lag_of(turns, length):
     """Return by how much (s) the course is stamped later than the gyro: the lag that leaves least unexplained.
 
-    Between the lags of whole windows (of a ``length`` in s) it is the top of a parabola.
+    Between lags of whole windows (of a ``length`` in s) the rate is taken to be even within each window: the rate of
+    the shifted one is a weighed mean of two. The bias of the gyro is the mean of the differences.
     """
     square = turns.course_square - turns.course**2 / turns.weight
     if turns.count < FEWEST_TURNS:
         return 0.0
-    best = 1
-    for k in range(2, 2 * LAGS):
-        if gain_by_lag(turns.shifted[k]) > gain_by_lag(turns.shifted[best]):
-            best = k
-    earlier, same, later = (
-        gain_by_lag(turns.shifted[best - 1]),
-        gain_by_lag(turns.shifted[best]),
-        gain_by_lag(turns.shifted[best + 1]),
-    )
-    bend = earlier - 2.0 * same + later
-    if bend >= 0.0:
-        return 0.0
-    shift = min(max(0.5 * (earlier - later) / bend, -0.5), 0.5)
-    peak = same - 0.25 * (earlier - later) * shift
-    sums = turns.shifted[best]
-    # What one window leaves, with noise as it was expected 1, and the share of its course that it leaves.
-    left = (sums[4] - sums[3] ** 2 / max(sums[0], 1e-12) - peak) / max(sums[0], 1e-12)
-    chance = max(1.0, left * turns.weight / turns.count)
+    lag, most, least = 0.0, 0.0, 0.0
+    for k in range(2 * LAGS):
+        none, left, share = left_between(turns.shifted[k])
+        if turns.weight * (none - left) > most:
+            lag, most, least = (k - LAGS + share) * length, turns.weight * (none - left), turns.weight * left
     # What has been told is held unless the turns speak against it.
-    lag = (best - LAGS + shift) * length
     held = HELD if turns.lag * lag > 0.0 else 1.0
-    is_shown = held * left * turns.weight < (1.0 - SAME**2) * square and peak > held * LAG_SIGMAS**2 * chance
+    chance = max(1.0, least / turns.count)
+    is_shown = held * least < (1.0 - SAME**2) * square and most > held * LAG_SIGMAS**2 * chance
     return lag if abs(lag) > held * NOTABLE_LAG and is_shown else 0.0
+
+
+@njit
+def left_between(sums):
+    """Return the mean square (rad2) left without a lag, that with the best lag between two, and its place (0 to 1)."""
+    weight = max(sums[4, 0], 1e-12)
+    a = sums[0, 0] - sums[3, 0] ** 2 / weight
+    b = sums[1, 1] - sums[3, 1] ** 2 / weight
+    both = sums[0, 1] - sums[3, 0] * sums[3, 1] / weight
+    none = sums[2, 2] - sums[3, 2] ** 2 / weight
+    spread = a + b - 2.0 * both
+    share = min(max((a - both) / spread, 0.0), 1.0) if spread > 0.0 else 0.0
+    return none / weight, (a - 2.0 * share * (a - both) + share * share * spread) / weight, share
 
 
 @njit

@@ -23,7 +23,7 @@ from eskf_ros.filter.integrity.fix_errors import (
     update_shares,
 )
 from eskf_ros.filter.integrity.heading_corrections import HEADING, forget_corrections, weigh_correction
-from eskf_ros.filter.integrity.heading_trial import continue_without_given_heading, is_refuted, update_trial
+from eskf_ros.filter.integrity.heading_trial import refute_heading, reset_to_found_heading, update_trial
 from eskf_ros.filter.integrity.humble_lane import (
     hear,
     linearize,
@@ -82,19 +82,13 @@ def reset_for_new_solution(states, aid, settings, work):
 def fuse_receiver(states, aid, gate, settings, work):
     """Fuse or refuse a position or velocity of GNSS; ``gate`` is the innovation gate of the filter (NIS)."""
     state, humble = states[FILTER], states[HUMBLE]
-    if (
-        state.heading_known == 1
-        and state.covariance[HEADING, HEADING] > LOST_HEADING_STD**2
-        and state.heading.given_stamp == NEVER
-    ):
-        # A gyro that did not measure has left no heading that a linear filter could correct: it is searched for.
-        reset_to_unknown_heading(state)
+    reset_lost_heading(state)
     update_trial(states, settings)
     start(states, settings)
     is_position = aid.stream == Stream.GNSS_POSITION
     if is_position:
         propagate_walk(state, state, aid.source)
-    is_wrong_heading = is_refuted(states, aid, gate, settings, work)
+    is_wrong_heading = refute_heading(states, aid, gate, settings, work)
     heard, jumps, believed, humble_nis, humble_log = judge_with_humble_lane(states, aid, gate, settings, work)
     size = linearize(state, aid, settings, work)
     if is_position:
@@ -135,7 +129,7 @@ def fuse_receiver(states, aid, gate, settings, work):
         aid.verdict = Verdict.RESET
         note_reset(state)
     if is_wrong_heading:
-        continue_without_given_heading(states)
+        reset_to_found_heading(states)
         aid.verdict = Verdict.TAKEOVER
     if aid.verdict in (Verdict.RESET, Verdict.TAKEOVER):
         forget_corrections(state)
@@ -144,6 +138,14 @@ def fuse_receiver(states, aid, gate, settings, work):
     if not heard:
         # A lane that starts now has its own noise over an outage that may follow.
         start(states, settings)
+
+
+@njit
+def reset_lost_heading(state):
+    """Search for the heading where a gyro that did not measure has left none that a linear filter could correct."""
+    is_lost = state.heading_known == 1 and state.covariance[HEADING, HEADING] > LOST_HEADING_STD**2
+    if is_lost and state.heading.given_stamp == NEVER:
+        reset_to_unknown_heading(state)
 
 
 @njit

@@ -31,6 +31,9 @@ DOUBTFUL_SIGMAS = 25.0
 IMPLAUSIBLE, IMPLAUSIBLE_SIGMAS = 2.0, 7.0
 """Prior and present standard deviations beyond which a fault of the installation is none, however certain it seems."""
 
+LARGE_MISFIT = 0.2
+"""Share by which the sum of the NIS exceeds its degrees of freedom from which on innovations are too large."""
+
 MANY_DEPARTURES = 3
 """Drifts off the path of the IMU from which on they may be why a fault of the installation seems certain."""
 
@@ -39,9 +42,6 @@ VERTICAL_SIGMAS = 30.0
 
 LARGEST_TIME_STD = 0.05
 """s; a time offset that is less certain is not told: at one speed it is an offset of the position, which may last."""
-
-SAME_TIME_SIGMAS = 2.0
-"""Standard deviations from which on positions are late, too, where velocities certainly are."""
 
 OPEN_SIGMAS = 3.0
 """Standard deviations of a time offset from which on it may be why: no other cause is told meanwhile."""
@@ -75,6 +75,7 @@ def aid_complaints(state: np.void, settings: np.void, is_explained: bool, is_imu
         # Fixes that scatter seem to jump.
         paths = [] if lies else _path_complaints(state, source)
         is_doubtful = is_imu_doubtful or bool(paths) or _departures(state, source) >= MANY_DEPARTURES
+        is_doubtful = is_doubtful or _is_unexplained(state, source)
         faults = _fault_complaints(state, settings, source, is_doubtful)
         # Those faults explain drifts, contradictions and a high NIS: no sentences of their own.
         found += paths + faults + lies
@@ -100,6 +101,13 @@ def _is_implausible(state: np.void, source: int) -> bool:
     """Say whether a fault seems certain that no installation has: something else is wrong, and looks like several."""
     estimate, sigma = (np.abs(state["installation"][name][source]) for name in ("estimate", "sigma"))
     return bool(np.any((estimate > IMPLAUSIBLE * np.array(FAULT_PRIOR)) & (estimate > IMPLAUSIBLE_SIGMAS * sigma)))
+
+
+def _is_unexplained(state: np.void, source: int) -> bool:
+    """Say whether innovations are too large, and the estimated faults leave most of it: something else is wrong."""
+    total, degrees = (float(value) for value in state["installation"]["misfit"][source])
+    excess, left = total - degrees, float(state["installation"]["unexplained"][source]) - degrees
+    return excess > LARGE_MISFIT * degrees and left > 0.5 * excess
 
 
 def _certain_faults(state: np.void, settings: np.void, source: int, is_doubtful: bool) -> np.ndarray:
@@ -130,8 +138,7 @@ def _fault_complaints(state: np.void, settings: np.void, source: int, is_doubtfu
     texts = []
     at_position, at_velocity = float(found[POSITION_TIME]), float(found[VELOCITY_TIME])
     likely = float(state["installation"]["estimate"][source, POSITION_TIME])
-    both = at_velocity and abs(likely) > SAME_TIME_SIGMAS * sigma[POSITION_TIME]
-    both = both and abs(likely - at_velocity) < 0.5 * abs(likely)
+    both = at_velocity and abs(likely - at_velocity) < 0.5 * abs(likely)
     if both:
         # Late positions seem to wander, and are less certain than late velocities.
         at_position = likely
