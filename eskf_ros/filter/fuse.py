@@ -19,6 +19,7 @@ from eskf_ros.filter.integrity.heading_monitor import (
     watch_heading,
     watch_slip,
 )
+from eskf_ros.filter.integrity.heading_trial import restart_trial
 from eskf_ros.filter.integrity.installation_monitor import find_faults, learn_faults
 from eskf_ros.filter.integrity.motion_monitor import watch_motion
 from eskf_ros.filter.integrity.receiver import fuse_receiver, reset_for_new_solution
@@ -139,6 +140,8 @@ def offer(states, aid, heading_before, settings, work):
         watch_wheels(state, aid)
     elif aid.stream == Stream.ZUPT:
         watch_rest(state, aid.verdict)
+        if aid.verdict == Verdict.FUSED:
+            restart_trial(states, settings)
 
 
 @njit

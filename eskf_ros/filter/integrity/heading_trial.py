@@ -19,7 +19,7 @@ from eskf_ros.filter.integrity.heading_corrections import HEADING
 from eskf_ros.filter.integrity.humble_lane import linearize, reset_to_lane
 from eskf_ros.filter.integrity.installation_monitor import forget_faults
 from eskf_ros.filter.measurements.kalman_update import update
-from eskf_ros.filter.state.enums import Stream, Verdict
+from eskf_ros.filter.state.enums import Verdict
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE
 from eskf_ros.filter.state.lanes import FILTER, HUMBLE
 from eskf_ros.filter.state.time import NEVER, SECOND
@@ -42,10 +42,7 @@ REFUTING_SIGMAS = 4.0
 
 @njit
 def update_trial(states, settings):
-    """Begin and end the trial of the heading; while the robot rests, the lane without it starts anew all the time.
-
-    In motion the filter is what the heading has made of it.
-    """
+    """Begin and end the trial of the heading."""
     state, trial = states[FILTER], states[FILTER].trial
     if state.heading.given_stamp == NEVER or state.heading_known == 0 or settings.has_humble_lane == 0:
         end_trial(states)
@@ -57,16 +54,21 @@ def update_trial(states, settings):
         start_without_heading(states, settings)
     if trial.is_on == 0:
         return
-    if trial.moved == NEVER:
-        if state.stamp - state.streams.fused_stamp[Stream.ZUPT.value, 0] < SECOND:
-            start_without_heading(states, settings)
-        if state.window.motion_stamp > trial.given_stamp:
-            trial.moved = state.stamp
+    if trial.moved == NEVER and state.window.motion_stamp > trial.given_stamp:
+        trial.moved = state.stamp
     is_over = trial.moved != NEVER and state.stamp - trial.moved > LONGEST_TRIAL
     if is_over or (trial.found != NEVER and state.stamp - trial.found > COMPARED_TIME):
         if trial.found != NEVER:
             state.heading.given_stamp = NEVER
         end_trial(states)
+
+
+@njit
+def restart_trial(states, settings):
+    """Start the lane anew from what the filter knows at rest; in motion it is what the heading has made of it."""
+    trial = states[FILTER].trial
+    if trial.is_on == 1 and trial.moved == NEVER:
+        start_without_heading(states, settings)
 
 
 @njit
