@@ -20,6 +20,7 @@ from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.scenario import Recording, simulate
 from faults import all_faults
 from monte_carlo import feed
+from support.data import find_data_folder
 
 Array = NDArray[np.float64]
 SECONDS = 70.0
@@ -109,6 +110,28 @@ def test_what_is_found_is_in_the_published_covariance(name: str, given: Filter) 
     """From two minutes on position and heading are within 5 standard deviations (bar 2 of docs/trust.md)."""
     fault = BY_NAME[name]
     figures = figures_of(fault, run_one(fault, recording_of(fault, 2), given))
+    assert figures.position_lies <= 0.01
+    assert figures.heading_lies <= 0.01
+
+
+@pytest.mark.parametrize(
+    ("name", "seed", "sentence"),
+    [
+        ("velocities stamped 0.13 s late", 0, r"the velocities are stamped 0\.1[23]\d s .* late"),
+        ("velocities stamped 0.13 s late", 1, r"the velocities are stamped 0\.1[23]\d s .* late"),
+        ("lever arm 1.5 m off in x", 0, r"the antenna seems to be \(-1\.[3-7]\d, \+0\.00, \+0\.00\) m"),
+        ("lever arm 1.5 m off in y", 1, r"the antenna seems to be \(\+0\.00, -1\.[3-7]\d, \+0\.00\) m"),
+    ],
+)
+def test_in_smooth_motion_one_fault_is_found_and_allowed_for(name: str, seed: int, sentence: str) -> None:
+    """Drives of another generator, whose accelerations grow over seconds: there all faults look alike."""
+    try:
+        drives = find_data_folder("independent_drives")
+    except FileNotFoundError as problem:
+        pytest.skip(str(problem))
+    trace = run_one(BY_NAME[name], recording_of(BY_NAME[name], seed, drives), TOLD_VELOCITY)
+    assert re.search(sentence, " ".join(trace.final))
+    figures = figures_of(BY_NAME[name], trace)
     assert figures.position_lies <= 0.01
     assert figures.heading_lies <= 0.01
 

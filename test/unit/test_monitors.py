@@ -12,9 +12,14 @@ from eskf_ros.filter.history.records import AID
 from eskf_ros.filter.integrity.fault_effects import POSITION_TIME, VELOCITY_TIME, write_effect_on_position
 from eskf_ros.filter.integrity.fix_errors import update_shares
 from eskf_ros.filter.integrity.heading_monitor import slip_of, watch_slip
-from eskf_ros.filter.integrity.installation_monitor import forget_uncertain_turns, learn_faults
+from eskf_ros.filter.integrity.installation_monitor import (
+    LASTING_LOOKS,
+    forget_uncertain_turns,
+    learn_faults,
+)
 from eskf_ros.filter.integrity.motion_report import _compared, travel_complaints
 from eskf_ros.filter.integrity.motion_sums import add_push, add_turn
+from eskf_ros.filter.integrity.receiver_report import aid_complaints
 from eskf_ros.filter.state.enums import Stream, Verdict
 from eskf_ros.filter.state.error_state import ATTITUDE, VELOCITY
 from eskf_ros.filter.state.time import NEVER, SECOND
@@ -193,3 +198,28 @@ def test_a_takeover_keeps_what_was_learnt_of_faults_and_what_they_have_done(stam
     assert state["installation"]["absorbed"][0, 0, VELOCITY_TIME] == 5.0
     assert (state["installation"]["evidence"] == 1.0).all()
     assert (state["installation"]["information"] == 2.0).all()
+
+
+@pytest.mark.parametrize(
+    ("total", "unexplained", "sigmas", "told"),
+    [
+        (1100.0, 1090.0, 12.0, True),
+        (1500.0, 1100.0, 12.0, True),
+        (1500.0, 1400.0, 12.0, False),
+        (1500.0, 1400.0, 30.0, True),
+    ],
+)
+def test_a_fault_that_leaves_innovations_too_large_must_be_very_certain(
+    total: float, unexplained: float, sigmas: float, told: bool
+) -> None:
+    """Innovations with 1000 degrees of freedom: where most of their excess stays, something else is wrong."""
+    state = make_state()
+    state["receiver"]["fix_count"][0] = 1000
+    installation = state["installation"]
+    installation["misfit"][0] = (total, 1000.0)
+    installation["unexplained"][0] = unexplained
+    installation["found"][0, 0] = installation["estimate"][0, 0] = 1.0
+    installation["sigma"][0] = 1.0 / sigmas
+    installation["held"][0, 0] = LASTING_LOOKS
+    texts = aid_complaints(state, SETTINGS, False, False)
+    assert any("gnss.lever_arm" in text for text in texts) == told
