@@ -117,5 +117,6 @@ def reset_to_found_heading(states):
     reset_to_lane(states[FILTER], states[HUMBLE])
     states[FILTER].heading.given_stamp = NEVER
     states[FILTER].trust.refused.fill(0)
+    states[FILTER].trust.takeovers += 1
     forget_faults(states[FILTER])
     end_trial(states)
