@@ -89,6 +89,9 @@ LONG_WINDOW = 2.0
 LONGEST_WINDOW = 3.5
 """s; a window that an outage has made longer is not judged."""
 
+LONGEST_HOLE = 0.5
+"""s; a window in which no sample of the IMU comes for longer is not judged."""
+
 RECENT = SECOND
 """ns; velocities count as coming if one has come for so short a time before the last fix, or later."""
 
@@ -131,8 +134,8 @@ def add_sample(state):
     """Add the newest IMU reading to the integrals of the window."""
     motion, interval = state.motion, state.imu.interval
     motion.longest_interval = max(motion.longest_interval, interval)
-    if interval > LONGEST_WINDOW:
-        motion.start_stamp = NEVER
+    if interval > LONGEST_HOLE:
+        forget_window(motion)
         return
     for i in range(3):
         motion.turned[i] += interval * state.imu.rate[i]
@@ -154,6 +157,8 @@ def watch_motion(state, aid, settings):
     """
     if aid.source != 0:
         return False
+    if (aid.stamp - state.imu.stamp) * 1e-9 > LONGEST_HOLE:
+        forget_window(state.motion)
     knew = state.motion.has_other_axes == 1
     if aid.stream == Stream.GNSS_VELOCITY:
         watch_velocity(state, aid, settings)

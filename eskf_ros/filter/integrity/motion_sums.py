@@ -89,8 +89,11 @@ SAME = 0.7
 HELD = 0.7
 """Share of the limits of a lag beyond which it stays once it is known."""
 
-LAG_SIGMAS = 4.0
+LAG_SIGMAS = 3.0
 """Standard deviations of a lag from which on it is certain."""
+
+COMMON_ERROR = 0.025
+"""rad; by which course and gyro differ in many windows together, where the bias of the gyro changes or fixes wander."""
 
 NOTABLE_LAG = 0.6
 """s; a time between course and gyro from which on it is told: less is found by the installation monitor."""
@@ -163,7 +166,7 @@ def lag_of(turns, length):
             lag, most, least = (k - LAGS + share) * length, turns.weight * (none - left), turns.weight * left
     # What has been told is held unless the turns speak against it.
     held = HELD if turns.lag * lag > 0.0 else 1.0
-    chance = max(1.0, least / turns.count)
+    chance = max(1.0, least / turns.count) + COMMON_ERROR**2 * turns.weight / turns.count
     is_shown = held * least < (1.0 - SAME**2) * square and most > held * LAG_SIGMAS**2 * chance
     return lag if abs(lag) > held * NOTABLE_LAG and is_shown else 0.0
 
