@@ -244,10 +244,7 @@ def find_faults(state, work):
     """Estimate the faults every `CHECK_INTERVAL`, and note which are certain.
 
     Only faults that the innovations ask for one after the other are estimated, the others are zero (`stepwise`): a
-    lever arm, a time offset and a scale explain the same in smooth motion. Innovations that the faults leave
-    unexplained, and a scatter that is larger than expected, widen the standard deviations, and errors of fixes that
-    last do. A fault is certain where neither none nor another in its place explains nearly as much. A large fault
-    leaks into the estimates of the others.
+    lever arm, a time offset and a scale explain much the same in smooth motion.
     """
     if state.stamp - state.installation.checked < CHECK_INTERVAL:
         return
@@ -256,26 +253,47 @@ def find_faults(state, work):
     for source in range(SOURCES):
         write_normal_equations(state, source, fit)
         choose_faults(state, source, fit, is_chosen)
-        largest, unexplained = 0.0, fit[FAULTS, FAULTS]
-        state.installation.unexplained[source] = unexplained
-        widest = widening(state, source, 0, unexplained)
-        for k in range(FAULTS):
-            variance = fit[k, k] if is_chosen[k] else 1.0 / fit[k, k]
-            state.installation.estimate[source, k] = fit[k, FAULTS] if is_chosen[k] else 0.0
-            state.installation.sigma[source, k] = math.sqrt(variance * widening(state, source, k, unexplained))
-            for m in range(FAULTS):
-                covariance = fit[k, m] * widest if is_chosen[k] and is_chosen[m] else 0.0
-                state.installation.covariance[source, k, m] = covariance
-            largest = max(largest, abs(state.installation.estimate[source, k]) / state.installation.sigma[source, k])
-        for k in range(FAULTS):
-            estimate, sigma = state.installation.estimate[source, k], state.installation.sigma[source, k]
-            is_small = abs(estimate) < max(FAULT_SIGMAS, LEAKAGE * largest) * sigma or abs(estimate) < LEAST_FAULT[k]
-            is_certain = is_chosen[k] and not is_small and abs(estimate) < LARGEST_FAULT * FAULT_PRIOR[k]
-            if is_certain:
-                least = FAULT_SIGMAS**2 * widening(state, source, k, unexplained)
-                is_certain = lost_by_exchange(fit, is_chosen, k) > least
-            state.installation.found[source, k] = estimate if is_certain else 0.0
-            state.installation.held[source, k] = state.installation.held[source, k] + 1 if is_certain else 0
+        write_estimates(state, source, fit, is_chosen)
+        note_certain_faults(state, source, fit, is_chosen)
+
+
+@njit
+def write_estimates(state, source, fit, is_chosen):
+    """Write the estimates of the chosen faults of a receiver and their covariance; the others are zero.
+
+    Innovations that the faults leave unexplained, a scatter that is larger than expected, and errors of fixes that last
+    widen the covariance (`widening`).
+    """
+    installation, unexplained = state.installation, fit[FAULTS, FAULTS]
+    installation.unexplained[source] = unexplained
+    widest = widening(state, source, 0, unexplained)
+    for k in range(FAULTS):
+        variance = fit[k, k] if is_chosen[k] else 1.0 / fit[k, k]
+        installation.estimate[source, k] = fit[k, FAULTS] if is_chosen[k] else 0.0
+        installation.sigma[source, k] = math.sqrt(variance * widening(state, source, k, unexplained))
+        for m in range(FAULTS):
+            covariance = fit[k, m] * widest if is_chosen[k] and is_chosen[m] else 0.0
+            installation.covariance[source, k, m] = covariance
+
+
+@njit
+def note_certain_faults(state, source, fit, is_chosen):
+    """Note which faults are certain: neither none nor another in its place explains nearly as much.
+
+    A large fault leaks into the estimates of the others.
+    """
+    installation, largest = state.installation, 0.0
+    for k in range(FAULTS):
+        largest = max(largest, abs(installation.estimate[source, k]) / installation.sigma[source, k])
+    for k in range(FAULTS):
+        estimate, sigma = installation.estimate[source, k], installation.sigma[source, k]
+        is_small = abs(estimate) < max(FAULT_SIGMAS, LEAKAGE * largest) * sigma or abs(estimate) < LEAST_FAULT[k]
+        is_certain = is_chosen[k] and not is_small and abs(estimate) < LARGEST_FAULT * FAULT_PRIOR[k]
+        if is_certain:
+            least = FAULT_SIGMAS**2 * widening(state, source, k, installation.unexplained[source])
+            is_certain = lost_by_exchange(fit, is_chosen, k) > least
+        installation.found[source, k] = estimate if is_certain else 0.0
+        installation.held[source, k] = installation.held[source, k] + 1 if is_certain else 0
 
 
 @njit
@@ -293,7 +311,8 @@ def write_normal_equations(state, source, fit):
 def choose_faults(state, source, fit, is_chosen):
     """Choose the faults one after the other, the one that explains most first, while one is not chance.
 
-    Errors of fixes that last do not count here: a fault that is not chosen counts as zero, which they do not show.
+    Errors of fixes that last do not count here: a fault that is not chosen is taken to be zero, and they are no reason
+    for that. They widen what is found (`widening`).
     """
     is_chosen.fill(0)
     while True:

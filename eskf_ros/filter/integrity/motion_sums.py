@@ -123,9 +123,9 @@ def add_turn(turns, before, after, turn, variance, start, passed):
         near = turn[2] if k == 0 else turns.recent[k - 1, 0]
         differences = (course - near, course - turns.recent[k, 0], course - turn[2])
         add_shifted(turns.shifted[LAGS + k], weight, differences)
-        rate, before, weight_before = turns.recent[k]
-        differences = (before - turn[2], before - turns.recent[0, 0], before - rate)
-        add_shifted(turns.shifted[LAGS - 1 - k], weight_before, differences)
+        before = turns.recent[k, 1]
+        differences = (before - turn[2], before - turns.recent[0, 0], before - turns.recent[k, 0])
+        add_shifted(turns.shifted[LAGS - 1 - k], turns.recent[k, 2], differences)
     for k in range(LAGS - 1, 0, -1):
         for i in range(3):
             turns.recent[k, i] = turns.recent[k - 1, i]
