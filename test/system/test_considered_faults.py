@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Callable
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +22,6 @@ from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.scenario import Recording, simulate
 from faults import all_faults
 from monte_carlo import feed
-from support.data import find_data_folder
 
 Array = NDArray[np.float64]
 SECONDS = 70.0
@@ -123,17 +124,23 @@ def test_what_is_found_is_in_the_published_covariance(name: str, given: Filter) 
         ("lever arm 1.5 m off in y", 1, r"the antenna seems to be \(\+0\.00, -1\.[3-7]\d, \+0\.00\) m"),
     ],
 )
-def test_in_smooth_motion_one_fault_is_found_and_allowed_for(name: str, seed: int, sentence: str) -> None:
+def test_in_smooth_motion_one_fault_is_found_and_allowed_for(
+    data_folder: Callable[[str], Path], name: str, seed: int, sentence: str
+) -> None:
     """Drives of another generator, whose accelerations grow over seconds: there all faults look alike."""
-    try:
-        drives = find_data_folder("independent_drives")
-    except FileNotFoundError as problem:
-        pytest.skip(str(problem))
+    drives = data_folder("independent_drives")
     trace = run_one(BY_NAME[name], recording_of(BY_NAME[name], seed, drives), TOLD_VELOCITY)
     assert re.search(sentence, " ".join(trace.final))
     figures = figures_of(BY_NAME[name], trace)
     assert figures.position_lies <= 0.01
     assert figures.heading_lies <= 0.01
+
+
+@pytest.mark.parametrize("name", ["holes of 1.6 s, dropped", "gyro bias step 1 deg/s"])
+def test_holes_and_biases_that_change_do_not_set_clocks_apart(data_folder: Callable[[str], Path], name: str) -> None:
+    """In smooth turns a window with a hole, or a gyro that reads 1 deg/s too much from 100 s on, look like a lag."""
+    trace = run_one(BY_NAME[name], recording_of(BY_NAME[name], 0, data_folder("independent_drives")), TOLD_VELOCITY)
+    assert not [sentence for sentence in trace.said if "clocks are apart" in sentence]
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +19,6 @@ from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.scenario import Recording, simulate
 from faults import all_faults
 from monte_carlo import feed
-from support.data import find_data_folder
 
 MOTION = 20.0
 """s; when the drives begin to move."""
@@ -107,12 +107,9 @@ def test_a_robot_that_waits_is_tried_with_what_it_knew_at_the_last_moment_at_res
     ],
 )
 def test_a_wrong_heading_does_not_lie_on_smooth_drives_of_another_generator(
-    name: str, given: Filter, seed: int
+    data_folder: Callable[[str], Path], name: str, given: Filter, seed: int
 ) -> None:
-    try:
-        drives = find_data_folder("independent_drives")
-    except FileNotFoundError as problem:
-        pytest.skip(str(problem))
+    drives = data_folder("independent_drives")
     figures = figures_of(FAULTS[name], run_one(FAULTS[name], recording_of(FAULTS[name], seed, drives), given))
     assert figures.heading_lies <= 0.01
     assert figures.position_lies <= 0.01

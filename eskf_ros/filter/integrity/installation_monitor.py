@@ -48,8 +48,8 @@ FAULT_SIGMAS = 6.0
 """Standard deviations from zero beyond which a fault is reported."""
 
 CONSIDERED_SIGMAS = 3.0
-"""Standard deviations from zero beyond which what faults do to an error is allowed for: to be wrong costs certainty
-only."""
+"""Standard deviations from zero beyond which a fault is estimated, and what faults do to an error is allowed for: to be
+wrong costs certainty only."""
 
 FOUND_SIGMAS = 1.0
 """The same once a fault is certain (`FAULT_SIGMAS`): what is left of it at the moment is allowed for, too."""
@@ -189,8 +189,7 @@ def update_considered(state, source):
     """Update what the faults of a receiver, as they are estimated, do to the errors of the core.
 
     The estimate is not corrected by it: it is held in the covariance that is published, as the effect of consider
-    parameters (Schmidt, 1966; Tapley, Schutz and Born, Statistical Orbit Determination, section 6.5). Two faults that
-    cannot be told apart yet have one effect, which is certain sooner than either of them.
+    parameters (Schmidt, 1966; Tapley, Schutz and Born, Statistical Orbit Determination, section 6.5).
     """
     installation = state.installation
     absorbed, estimate = installation.absorbed[source], installation.estimate[source]

@@ -21,7 +21,7 @@ TURNS = np.dtype(
         ("gyro", "f8", (3,)),
         ("gyro_square", "f8", (3,)),
         ("product", "f8", (3,)),
-        ("shifted", "f8", (2 * LAGS, 5, 3)),
+        ("shifted", "f8", (2 * LAGS, 4, 4)),
         ("recent", "f8", (LAGS, 3)),
         ("recent_count", "i8"),
         ("last_stamp", "i8"),
@@ -32,8 +32,7 @@ TURNS = np.dtype(
 """Sums over windows of the change of course and the integrated rates (rad, axes of base_link), weighted (1/rad2).
 
 ``shifted``: at `LAGS` + k, of the windows whose course is compared with the rates about z of k and of k + 1 windows
-earlier and of the same window: the products of these three differences (rows 0 to 2), their sums (row 3), and
-those of the weights (row 4).
+earlier and of the same window: the weighed products of these three differences and of 1 with each other.
 ``recent``, ``recent_count``, ``last_stamp``: rate about z, course and weight of the windows before this one, the newest
 first; how many of them follow each other without a hole; the end of the newest (ns). ``lag``: by how much the receiver
 is stamped later than the IMU (s); 0 where it is less than notable, or not known.
@@ -116,16 +115,14 @@ def add_turn(turns, before, after, turn, variance, start, passed):
     if start != turns.last_stamp:
         turns.recent_count = 0
     for k in range(2 * LAGS):
-        for i in range(5):
-            for j in range(3):
+        for i in range(4):
+            for j in range(4):
                 turns.shifted[k, i, j] *= remains
     for k in range(min(turns.recent_count, LAGS)):
         near = turn[2] if k == 0 else turns.recent[k - 1, 0]
-        differences = (course - near, course - turns.recent[k, 0], course - turn[2])
-        add_shifted(turns.shifted[LAGS + k], weight, differences)
-        before = turns.recent[k, 1]
-        differences = (before - turn[2], before - turns.recent[0, 0], before - turns.recent[k, 0])
-        add_shifted(turns.shifted[LAGS - 1 - k], turns.recent[k, 2], differences)
+        add_shifted(turns.shifted[LAGS + k], weight, course, (near, turns.recent[k, 0], turn[2]))
+        earlier = turns.recent[k]
+        add_shifted(turns.shifted[LAGS - 1 - k], earlier[2], earlier[1], (turn[2], turns.recent[0, 0], earlier[0]))
     for k in range(LAGS - 1, 0, -1):
         for i in range(3):
             turns.recent[k, i] = turns.recent[k - 1, i]
@@ -140,13 +137,12 @@ def add_turn(turns, before, after, turn, variance, start, passed):
 
 
 @njit
-def add_shifted(sums, weight, differences):
-    """Add three differences (rad) of a course from rates to ``sums`` (5, 3): see `TURNS`."""
-    for i in range(3):
-        for j in range(3):
+def add_shifted(sums, weight, course, turns_about_z):
+    """Add the differences of a course (rad) from three integrated rates to ``sums`` (4, 4): see `TURNS`."""
+    differences = (course - turns_about_z[0], course - turns_about_z[1], course - turns_about_z[2], 1.0)
+    for i in range(4):
+        for j in range(4):
             sums[i, j] += weight * differences[i] * differences[j]
-        sums[3, i] += weight * differences[i]
-        sums[4, i] += weight
 
 
 @njit
@@ -156,9 +152,9 @@ def lag_of(turns, length):
     Between lags of whole windows (of a ``length`` in s) the rate is taken to be even within each window: the rate of
     the shifted one is a weighed mean of two. The bias of the gyro is the mean of the differences.
     """
-    square = turns.course_square - turns.course**2 / turns.weight
     if turns.count < FEWEST_TURNS:
         return 0.0
+    square = turns.course_square - turns.course**2 / turns.weight
     lag, most, least = 0.0, 0.0, 0.0
     for k in range(2 * LAGS):
         none, left, share = left_between(turns.shifted[k])
@@ -174,7 +170,7 @@ def lag_of(turns, length):
 @njit
 def left_between(sums):
     """Return the mean square (rad2) left without a lag, that with the best lag between two, and its place (0 to 1)."""
-    weight = max(sums[4, 0], 1e-12)
+    weight = max(sums[3, 3], 1e-12)
     a = sums[0, 0] - sums[3, 0] ** 2 / weight
     b = sums[1, 1] - sums[3, 1] ** 2 / weight
     both = sums[0, 1] - sums[3, 0] * sums[3, 1] / weight
