@@ -72,12 +72,13 @@ def test_a_right_heading_stays_and_is_believed_once_the_trial_is_over(seed: int)
     off = 5.0 * float(np.random.default_rng(seed).standard_normal())
     navigator, was_on = filter_of(recording, off), False
     for seconds, state in states(recording, navigator):
+        if was_on and not state["trial"]["is_on"]:
+            assert state["heading"]["given_stamp"] == NEVER
         was_on |= bool(state["trial"]["is_on"])
         assert state["heading_known"] or not state["level_known"]
         assert heading_error(recording, seconds, state) < math.radians(20.0) or not state["level_known"]
     assert was_on
     assert state["trial"]["is_on"] == 0
-    assert state["heading"]["given_stamp"] == NEVER
     assert navigator.complaints == []
 
 

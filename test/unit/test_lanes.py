@@ -7,14 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from eskf_ros.filter.alignment.heading_search import LEAST_ACCELERATION_STD, TILT
 from eskf_ros.filter.history.records import AID
+from eskf_ros.filter.integrity.heading_trial import reset_to_found_heading, start_without_heading
 from eskf_ros.filter.integrity.humble_lane import EVIDENCE, reset_to_humble_lane, update_doubt, weigh_evidence
 from eskf_ros.filter.integrity.motion_monitor import compare_axes, offset_by_jumps
 from eskf_ros.filter.integrity.refusal import FEWEST, rival_offset
 from eskf_ros.filter.layout import blank_state
 from eskf_ros.filter.state.enums import Stream
-from eskf_ros.filter.state.error_state import ACCEL_BIAS, GYRO_BIAS
+from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, GYRO_BIAS
 from eskf_ros.filter.state.time import NEVER, SECOND
+from eskf_ros.geodesy.earth import STANDARD_GRAVITY
 from support.kernels import make_settings, make_work
 
 SETTINGS = make_settings()
@@ -32,6 +35,35 @@ def lanes(gyro_bias: float) -> Any:
         state["covariance"][:15, :15] = covariance
     states[1]["position_map"], states[1]["gyro_bias"] = (5.0, 0.0, 0.0), gyro_bias
     return states
+
+
+def test_what_was_thought_with_a_wrong_heading_is_forgotten_with_it() -> None:
+    states = lanes(1e-3)
+    state = states[0]
+    state["heading"]["given_stamp"], state["trial"]["is_on"] = 900 * SECOND, 1
+    state["trust"]["refused"] = 7
+    state["installation"]["stamp"], state["installation"]["misfit"] = 999 * SECOND, 5.0
+    reset_to_found_heading(states)
+    np.testing.assert_allclose(state["position_map"], (5.0, 0.0, 0.0))
+    np.testing.assert_allclose(state["gyro_bias"], 1e-3)
+    assert state["heading"]["given_stamp"] == state["installation"]["stamp"] == NEVER
+    assert (state["trial"]["is_on"], state["trust"]["takeovers"]) == (0, 1)
+    assert not state["trust"]["refused"].any()
+    assert not state["installation"]["misfit"].any()
+    # The humble lane starts anew from the filter, to judge it.
+    assert states[1]["heading_known"] == 0
+
+
+@pytest.mark.parametrize("tilt_std", [1e-4, 0.05])
+def test_the_lane_without_the_heading_knows_the_tilt_no_better_than_the_filter(tilt_std: float) -> None:
+    states = lanes(0.0)
+    state = states[0]
+    for k in (ATTITUDE, ATTITUDE + 1):
+        state["covariance"][k, k] = tilt_std**2 + (1e-3 / STANDARD_GRAVITY) ** 2
+    start_without_heading(states, SETTINGS)
+    assert states[1]["heading_known"] == 0
+    expected = STANDARD_GRAVITY**2 * state["covariance"][ATTITUDE, ATTITUDE] + LEAST_ACCELERATION_STD**2
+    assert states[1]["search"]["covariance"][TILT, TILT] == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.parametrize("sigmas", [0.5, 1.5])

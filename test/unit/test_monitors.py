@@ -14,6 +14,7 @@ from eskf_ros.filter.integrity.fix_errors import update_shares
 from eskf_ros.filter.integrity.heading_monitor import slip_of, watch_slip
 from eskf_ros.filter.integrity.installation_monitor import (
     LASTING_LOOKS,
+    find_faults,
     forget_uncertain_turns,
     learn_faults,
 )
@@ -198,6 +199,24 @@ def test_a_takeover_keeps_what_was_learnt_of_faults_and_what_they_have_done(stam
     assert state["installation"]["absorbed"][0, 0, VELOCITY_TIME] == 5.0
     assert (state["installation"]["evidence"] == 1.0).all()
     assert (state["installation"]["information"] == 2.0).all()
+
+
+@pytest.mark.parametrize(("alike", "found"), [(0.9, True), (0.999, False)])
+def test_a_fault_is_certain_where_no_other_explains_the_same(alike: float, found: bool) -> None:
+    """A lever arm of 1 m at 30 sigmas, and a time offset whose effect has the correlation ``alike`` with its own."""
+    state, work = make_state(), make_work()
+    state["stamp"] = 1000 * SECOND
+    installation = state["installation"]
+    scale = np.array([30.0, 300.0])
+    pair = np.ix_([0], [0, POSITION_TIME], [0, POSITION_TIME])
+    installation["information"][pair] = np.outer(scale, scale) * [[1.0, alike], [alike, 1.0]]
+    installation["evidence"][0, [0, POSITION_TIME]] = scale * 30.0 * np.array([1.0, alike])
+    installation["misfit"][0] = (3000.0 + 900.0, 3000.0)
+    find_faults(state, work)
+    assert installation["estimate"][0, 0] == pytest.approx(1.0, rel=0.01)
+    assert installation["estimate"][0, POSITION_TIME] == 0.0
+    assert installation["unexplained"][0] == pytest.approx(3000.0, rel=0.01)
+    assert bool(installation["found"][0, 0]) == found
 
 
 @pytest.mark.parametrize(
