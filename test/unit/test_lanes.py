@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from eskf_ros.filter.alignment.heading_search import LEAST_ACCELERATION_STD, TILT
+from eskf_ros.filter.alignment.heading_sensors import CONFIRMATIONS, confirm_given_heading
 from eskf_ros.filter.history.records import AID
 from eskf_ros.filter.integrity.heading_trial import reset_to_found_heading, start_without_heading
 from eskf_ros.filter.integrity.humble_lane import EVIDENCE, reset_to_humble_lane, update_doubt, weigh_evidence
@@ -52,6 +53,16 @@ def test_what_was_thought_with_a_wrong_heading_is_forgotten_with_it() -> None:
     assert not state["installation"]["misfit"].any()
     # The humble lane starts anew from the filter, to judge it.
     assert states[1]["heading_known"] == 0
+
+
+@pytest.mark.parametrize("is_on", [True, False])
+def test_fused_messages_do_not_confirm_a_heading_while_it_is_on_trial(is_on: bool) -> None:
+    """A filter that believes a wrong heading bends everything to fit, and then fuses all messages."""
+    state = lanes(0.0)[0]
+    state["heading"]["given_stamp"], state["trial"]["is_on"], state["excitation"]["left"] = SECOND, is_on, 5.0
+    for _ in range(CONFIRMATIONS):
+        confirm_given_heading(state)
+    assert (state["heading"]["given_stamp"] == SECOND) == is_on
 
 
 @pytest.mark.parametrize("tilt_std", [1e-4, 0.05])
