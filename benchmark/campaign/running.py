@@ -23,7 +23,7 @@ from eskf_ros.simulate.episodes import ClockSet
 from eskf_ros.simulate.imu import ImuMount
 from eskf_ros.simulate.scenario import Recording, simulate
 from eskf_ros.tables.feeding import rows_from
-from monte_carlo import NO_SIDE_SLIP, Message, feed, messages_of, published_covariance
+from monte_carlo import NO_SIDE_SLIP, Message, feed, messages_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -152,12 +152,12 @@ def run_one(
     start = int(recording.truth_stamp[0])
     taken = (recording.imu_taken - start) * 1e-9
     stops = np.unique(np.searchsorted(taken, np.arange(1.0, taken[-1])))
-    states: list[np.ndarray] = []
+    rows: list[np.ndarray] = []
     parts = []
     said: dict[str, float] = {}
     for k, state in enumerate(states_at(stops, recording, navigator, messages, has_order_of_arrival(fault))):
-        if states or state["position_known"]:
-            states.append(state.copy())
+        if rows or state["position_known"]:
+            rows.append(navigator.odometry)
         if k % ASKED_EVERY == 0:
             parts.append(navigator.take_records())
             for sentence in sentences(navigator):
@@ -166,18 +166,10 @@ def run_one(
     final = () if any(sentence.startswith(RAISED) for sentence in sentences(navigator)) else tuple(navigator.complaints)
     for sentence in sentences(navigator):
         said.setdefault(sentence, float(taken[-1]))
-    if not states:  # The filter never started: it claims nothing, and has nothing but its word.
-        states.append(state.copy())
+    if not rows:  # The filter never started: it claims nothing, and has nothing but its word.
+        rows.append(navigator.odometry)
     records = np.concatenate(parts, dtype=RECORD)
-    return _trace(recording, navigator, stops, _together(states), records, said, final)
-
-
-def _together(states: Sequence[np.ndarray]) -> np.ndarray:
-    """Return one array of states; `numpy.array` would compare their hundreds of fields one with the other."""
-    found = np.empty(len(states), states[0].dtype)
-    for k, state in enumerate(states):
-        found[k] = state
-    return found
+    return _trace(recording, navigator, stops, np.concatenate(rows), records, said, final)
 
 
 def has_order_of_arrival(fault: Fault) -> bool:
@@ -214,26 +206,28 @@ def _trace(
     recording: Recording,
     navigator: Navigator,
     stops: NDArray[np.int64],
-    states: np.ndarray,
+    rows: np.ndarray,
     records: np.ndarray,
     said: dict[str, float],
     final: tuple[str, ...],
 ) -> Trace:
-    stops = stops[len(stops) - len(states) :]
+    stops = stops[len(stops) - len(rows) :]
     start = recording.truth_stamp[0]
     truth_seconds = (recording.truth_stamp - start) * 1e-9
     seconds = np.clip((recording.imu_taken[stops] - start) * 1e-9, 0.0, truth_seconds[-1])
-    mount = ImuMount(recording.options.imu_position, recording.options.imu_rpy_deg)
     attitudes = Rotation.from_quat(recording.truth_attitude_body_to_map[:, [1, 2, 3, 0]])
     body_to_map = Slerp(truth_seconds, attitudes)(seconds)
     position = np.column_stack([np.interp(seconds, truth_seconds, axis) for axis in recording.truth_position_map.T])
-    position = position + body_to_map.apply(mount.position)
+    # The errors are those of the IMU: where a wrong mounting is the fault, that of base_link is judged by its name.
+    mount = ImuMount(recording.options.imu_position, recording.options.imu_rpy_deg)
+    told = ImuMount(navigator.parameters.imu.mount_position, navigator.parameters.imu.mount_rpy_deg)
+    estimated = Rotation.from_quat(rows["attitude_body_to_map"][:, [1, 2, 3, 0]])
+    away = position + body_to_map.apply(mount.position) - rows["position_map"] - estimated.apply(told.position)
     imu_to_map = body_to_map * Rotation.from_matrix(mount.rotation_imu_to_body)
-    turn = (imu_to_map * Rotation.from_quat(states["attitude"][:, [1, 2, 3, 0]]).inv()).as_rotvec()
-    covariance = published_covariance(states)
-    away = position - states["position_map"]
-    is_known = states["heading_known"].astype(bool)
-    sigma = np.sqrt(np.maximum(covariance[:, 8, 8], 1e-12))
+    turn = (imu_to_map * (estimated * Rotation.from_matrix(told.rotation_imu_to_body)).inv()).as_rotvec()
+    is_known = rows["heading_known"]
+    variances = np.maximum(np.einsum("nii->ni", rows["pose_covariance"]), 1e-12)
+    sigma = np.sqrt(variances[:, 5])
     was_known = is_known[:-1] & (sigma[:-1] < KNOWN) & (np.abs(turn[:-1, 2]) < KNOWN)
     rest = records[(records["stream"] == Stream.ZUPT) & (records["verdict"] == Verdict.FUSED)]["stamp"]
     turning = records[(records["stream"] == Stream.ZARU) & (records["verdict"] == Verdict.FUSED)]["stamp"]
@@ -249,7 +243,7 @@ def _trace(
     return Trace(
         seconds=seconds,
         error=np.hypot(away[:, 0], away[:, 1]),
-        sigma=np.sqrt(np.maximum(covariance[:, 0, 0] + covariance[:, 1, 1], 1e-12)),
+        sigma=np.sqrt(variances[:, 0] + variances[:, 1]),
         heading_error=turn[:, 2],
         heading_sigma=sigma,
         is_known=is_known,

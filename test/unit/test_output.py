@@ -164,6 +164,26 @@ def test_what_faults_of_the_installation_do_is_published_as_if_the_state_had_tha
 
 
 @seeds
+def test_an_unknown_heading_leaves_the_place_about_the_antenna_unknown(seed: int) -> None:
+    """What is added is the mean square over all headings of the distance to the base_link of the published one."""
+    settings = make_settings(
+        imu__mount_position=list(MOUNT_POSITION), imu__mount_rpy_deg=list(MOUNT_RPY_DEG), gnss__lever_arm=[0.8, -0.3, 1.2]
+    )
+    state = running(seed)
+    known = published(state, settings)
+    state["heading_known"] = 0
+    unknown = published(state, settings)
+    w, x, y, z = known["attitude_body_to_map"]
+    arm = Rotation.from_quat([x, y, z, w]).apply([0.8, -0.3, 1.2])
+    turns = Rotation.from_euler("z", np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)[:, None])
+    moved = turns.apply(arm) - arm
+    added = unknown["pose_covariance"] - known["pose_covariance"]
+    np.testing.assert_allclose(np.trace(added), (moved[:, :2] ** 2).sum(axis=1).mean(), rtol=1e-9)
+    np.testing.assert_allclose(added[0, 0], added[1, 1])
+    assert np.count_nonzero(added) == 2
+
+
+@seeds
 def test_clocks_that_are_apart_leave_the_way_of_that_time_unknown(seed: int) -> None:
     state = running(seed)
     before = published(state, MOUNTED)

@@ -118,6 +118,8 @@ def write_odometry(state, local, settings, row):
         for i in range(3):
             for j in range(3):
                 row.pose_covariance[i, j] += lag * lag * velocity[i] * velocity[j]
+    if state.heading_known == 0:
+        add_unknown_heading(state, imu_offset, settings, row)
 
 
 @njit
@@ -232,3 +234,16 @@ def add_considered_faults(state, source, imu_offset, base_to_map, row):
     for i in range(3):
         for j in range(3):
             row.twist_covariance[i, j] += forward[i] * forward[j]
+
+
+@njit
+def add_unknown_heading(state, imu_offset, settings, row):
+    """Add what an unknown heading does to the position of base_link, since GNSS measures that of the antenna.
+
+    The horizontal arm l from base_link to the antenna points anywhere: E |R(a) l - R(b) l|^2 = 2 |l|^2 for a uniform
+    angle a, |l|^2 for each axis.
+    """
+    antenna = rotate(to_matrix(state.attitude), settings.lever_arms_body[0])
+    arm_squared = (antenna[0] + imu_offset[0]) ** 2 + (antenna[1] + imu_offset[1]) ** 2
+    for i in range(2):
+        row.pose_covariance[i, i] += arm_squared
