@@ -202,6 +202,7 @@ WORK = np.dtype(
         ("jacobian", "f8", (3, ERROR_CAPACITY)),
         ("innovation", "f8", (3,)),
         ("noise", "f8", (3, 3)),
+        ("direct_effect", "f8", (3, FAULTS)),
         ("effect", "f8", (3, FAULTS)),
         ("fault_fit", "f8", (FAULTS + 1, FAULTS + 1)),
         ("is_chosen", "i8", (FAULTS,)),
@@ -240,7 +241,8 @@ WORK = np.dtype(
   zero unless the measurement writes it; ``holds_heading``: 1 for GNSS, which shows the heading by accelerations
   alone, and with it the error at ``heading_offset_at``.
 - ``projected`` ... ``correction``: intermediate results of the update.
-- ``effect``: derivative of the measurement by the faults of its receiver; ``fault_fit``, ``is_chosen``: normal
+- ``direct_effect``: derivative of the measurement by the faults of its receiver, ``effect``: that of its innovation,
+  which the estimate has in part absorbed; ``fault_fit``, ``is_chosen``: normal
   equations of these, and the ones that are estimated (`installation_monitor`, `stepwise`).
 - ``solution``, ``solution_covariance``: position or velocity (map) of the antenna from the ranges of one epoch.
 - ``signal_*`` ... ``step``: the signals of one epoch and their least squares.

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from campaign.fault import DEFAULT_POSITION, DEFAULT_VELOCITY, TOLD_POSITION, TOLD_VELOCITY, Filter
 from campaign.judge import figures_of
-from campaign.running import recording_of, run_one
+from campaign.running import IMU_NOISE, recording_of, run_one
 from eskf_ros.filter.integrity.fault_effects import FAULTS, GYRO_DRIFT, GYRO_SCALE, POSITION_TIME, VELOCITY_TIME
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.parameters.mapping import from_mapping
@@ -92,6 +93,28 @@ def test_the_estimate_follows_a_fault_as_the_monitor_says(fault: int) -> None:
     # Accelerations that may be tilt or bias are left out of the time of velocities on purpose.
     tolerance = 0.35 if fault == VELOCITY_TIME else 0.25
     np.testing.assert_allclose(after - before, expected, rtol=0.0, atol=tolerance * scale)
+
+
+@pytest.mark.parametrize("is_told", [True, False])
+def test_a_drive_without_faults_gives_no_evidence_of_them(is_told: bool) -> None:
+    """Evidence over the root of its information is standard normal, or less where the noise told is too large.
+
+    A regressor that has seen the innovation, such as the velocity after the update, would explain it.
+    """
+    squares = []
+    for seed in range(12):
+        recording = simulate("drive", seed=seed, imu_rate=100.0, stop=80.0)
+        recording = dataclasses.replace(recording, velocity_stamp=recording.velocity_stamp[:0])
+        parameters = recording.parameters()
+        if not is_told:
+            parameters = {name: value for name, value in parameters.items() if name.split(".")[-1] not in IMU_NOISE}
+        navigator = Navigator(from_mapping(parameters))
+        _, state = next(iter(feed(recording, navigator, np.array([len(recording.imu_stamp) - 1]))))
+        found = state["installation"]
+        squares.append(found["evidence"][0] ** 2 / np.maximum(np.diagonal(found["information"][0]), 1e-12))
+    seen = np.array(squares)[:, [0, 1, 2, POSITION_TIME]]
+    assert (seen.sum(axis=0) < chi2.ppf(0.9999, len(seen))).all(), seen.sum(axis=0)
+    assert (seen.sum(axis=0) > 0.5).all()
 
 
 @pytest.mark.parametrize(

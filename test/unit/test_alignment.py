@@ -320,6 +320,24 @@ def driving(velocity: Any, velocity_covariance: Any, heading: float | None = Non
     return state
 
 
+def test_the_filter_goes_on_from_the_search_that_has_found_the_heading() -> None:
+    """East and north of position and velocity are those of the search, which has used the accelerations."""
+    state = driving((8.0, 3.0, 0.5), np.diag([0.04, 0.09]))
+    before, block = copy_of(state), random_covariance(1, [0.5, 0.5, 0.2, 0.2])
+    state["search"]["estimate"][:4] = found = np.array([101.0, 49.0, 8.5, 2.5])
+    state["search"]["covariance"][:4, :4] = block
+    heading_start.begin_with_search(state, 0.3, 0.05, make_settings(**LEVER_ARM))
+    assert state["heading_known"] == 1
+    np.testing.assert_array_equal([*state["position_map"][:2], *state["velocity_map"][:2]], found)
+    assert state["velocity_map"][2] == before["velocity_map"][2]
+    horizontal = [0, 1, 3, 4]
+    np.testing.assert_array_equal(core(state)[np.ix_(horizontal, horizontal)], block)
+    others = np.setdiff1d(np.arange(15), horizontal)
+    assert not core(state)[np.ix_(horizontal, others)].any()
+    assert core(state)[8, 8] == pytest.approx(0.05**2)
+    assert conditioned_eigenvalues(core(state)).min() > 0.0
+
+
 def test_course_alignment_is_no_worse_than_it_says() -> None:
     """Heading error over its sigma, for velocities in error as their covariance says and a crab angle as declared.
 

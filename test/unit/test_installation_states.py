@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from eskf_ros.filter.alignment.heading import reset_heading
+from eskf_ros.filter.alignment.heading import begin_with_heading
 from eskf_ros.filter.alignment.levelling import reset_tilt
 from eskf_ros.filter.integrity.humble_lane import size_for_gnss
 from eskf_ros.filter.measurements.antenna import antenna_velocity, lever_arm_of, time_offset_of
@@ -116,7 +116,7 @@ def test_an_open_lever_arm_makes_the_position_uncertain_once_the_heading_is_know
     state["covariance"][POSITION : POSITION + 3, :] = 0.0
     state["covariance"][:, POSITION : POSITION + 3] = 0.0
     place = slice(int(ALL["lever_arm_at"]), int(ALL["lever_arm_at"]) + 3)
-    reset_heading(state, 1.0, 0.1, ALL)
+    begin_with_heading(state, 1.0, 0.1, ALL)
     covariance = state["covariance"]
     to_map = np.array(to_matrix(state["attitude"])) @ ALL["imu_to_base"].T
     np.testing.assert_allclose(covariance[POSITION : POSITION + 3, place], -0.25 * to_map, atol=1e-12)

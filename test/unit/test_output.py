@@ -31,6 +31,8 @@ MOUNT_RPY_DEG = (170.0, -35.0, 60.0)
 MOUNTED = make_settings(imu__mount_position=list(MOUNT_POSITION), imu__mount_rpy_deg=list(MOUNT_RPY_DEG))
 TURNED_ONLY = make_settings(imu__mount_rpy_deg=list(MOUNT_RPY_DEG))
 
+ARM = [0.8, -0.3, 1.2]
+
 seeds = pytest.mark.parametrize("seed", range(5))
 
 PERTURBATION = np.repeat([1e-2, 1e-2, 1e-5, 1e-2, 1e-4], 3)
@@ -167,14 +169,14 @@ def test_what_faults_of_the_installation_do_is_published_as_if_the_state_had_tha
 def test_an_unknown_heading_leaves_the_place_about_the_antenna_unknown(seed: int) -> None:
     """What is added is the mean square over all headings of the distance to the base_link of the published one."""
     settings = make_settings(
-        imu__mount_position=list(MOUNT_POSITION), imu__mount_rpy_deg=list(MOUNT_RPY_DEG), gnss__lever_arm=[0.8, -0.3, 1.2]
+        imu__mount_position=list(MOUNT_POSITION), imu__mount_rpy_deg=list(MOUNT_RPY_DEG), gnss__lever_arm=ARM
     )
     state = running(seed)
     known = published(state, settings)
     state["heading_known"] = 0
     unknown = published(state, settings)
     w, x, y, z = known["attitude_body_to_map"]
-    arm = Rotation.from_quat([x, y, z, w]).apply([0.8, -0.3, 1.2])
+    arm = Rotation.from_quat([x, y, z, w]).apply(ARM)
     turns = Rotation.from_euler("z", np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)[:, None])
     moved = turns.apply(arm) - arm
     added = unknown["pose_covariance"] - known["pose_covariance"]

@@ -19,7 +19,7 @@ from eskf_ros.filter.inertial.navigation_frame import (
 from eskf_ros.filter.measurements.gnss_position import position_of_fix
 from eskf_ros.filter.measurements.jacobians import set_east_north_up_covariance
 from eskf_ros.filter.state.enums import Stream
-from eskf_ros.filter.state.error_state import ATTITUDE, POSITION
+from eskf_ros.filter.state.error_state import ATTITUDE, POSITION, VELOCITY
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.geodesy.earth import east_north_up_to_ecef, geodetic_to_ecef
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix, wrapped
@@ -87,8 +87,39 @@ def reset_heading(state, heading, std, settings):
         turned = rotate(to_matrix(state.attitude), settings.lever_arms_body[0])
         for i in range(3):
             state.position_map[i] += lever[i] - turned[i]
-        if state.heading_known == 0:
-            inflate_position_by_antenna(state, settings)
+
+
+@njit
+def begin_with_heading(state, heading, std, settings):
+    """Set the unknown heading (rad, map), with the standard deviation ``std`` (rad); it is known from now on."""
+    reset_heading(state, heading, std, settings)
+    if state.position_known == 1:
+        inflate_position_by_antenna(state, settings)
+    state.heading_known = 1
+
+
+@njit
+def begin_with_search(state, heading, std, settings):
+    """Set the unknown heading (rad, map), and continue with position and velocity of the search that has found it.
+
+    Without a heading the filter knows no accelerations, so its velocity lags behind; the search has used them.
+    """
+    reset_heading(state, heading, std, settings)
+    found, covariance = state.search, state.covariance
+    for k in range(2):
+        state.position_map[k] = found.estimate[k]
+        state.velocity_map[k] = found.estimate[2 + k]
+        for j in range(state.error_size):
+            covariance[POSITION + k, j] = covariance[j, POSITION + k] = 0.0
+            covariance[VELOCITY + k, j] = covariance[j, VELOCITY + k] = 0.0
+    for k in range(2):
+        for m in range(2):
+            covariance[POSITION + k, POSITION + m] = found.covariance[k, m]
+            covariance[VELOCITY + k, VELOCITY + m] = found.covariance[2 + k, 2 + m]
+            covariance[POSITION + k, VELOCITY + m] = found.covariance[k, 2 + m]
+            covariance[VELOCITY + m, POSITION + k] = found.covariance[k, 2 + m]
+    inflate_position_by_antenna(state, settings)
+    state.heading_known = 1
 
 
 @njit
@@ -143,8 +174,7 @@ def search_heading(state, aid, gate, settings, work):
         found, found_std = turn_found(state)
         does_agree = found_std == math.inf or abs(wrapped(turn - found)) < CERTAIN * math.hypot(std, found_std)
         if std <= settings.found_heading_std and does_agree:
-            reset_heading(state, heading_of(state, settings) + turn, std, settings)
-            state.heading_known = 1
+            begin_with_heading(state, heading_of(state, settings) + turn, std, settings)
             return
     search_with(state, first, measured, lever, gate, settings, work)
 
@@ -163,8 +193,7 @@ def search_with(state, first, measured, lever, gate, settings, work):
         begin_search(state, measured[0], measured[1], max(work.noise[0, 0], work.noise[1, 1]) + reach)
     turn, std = turn_found(state)
     if std <= settings.found_heading_std:
-        reset_heading(state, heading_of(state, settings) + turn, std, settings)
-        state.heading_known = 1
+        begin_with_search(state, heading_of(state, settings) + turn, std, settings)
     elif settings.use_course == 1:
         align_to_course(state, settings)
 
@@ -185,8 +214,7 @@ def align_to_course(state, settings):
         state.search.course_since = state.stamp
     speed = math.hypot(state.search.estimate[2], state.search.estimate[3])
     if (state.stamp - state.search.course_since) * 1e-9 * speed >= COURSE_WAY:
-        reset_heading(state, heading, std, settings)
-        state.heading_known = 1
+        begin_with_search(state, heading, std, settings)
 
 
 @njit
@@ -255,6 +283,5 @@ def reset_heading_from_memory(state, payload, settings):
         return
     f = settings.remembered_forward_ecef
     forward = rotate_back(state.frame.map_to_ecef, (f[0], f[1], f[2]))
-    reset_heading(state, math.atan2(forward[1], forward[0]), settings.remembered_heading_std, settings)
-    state.heading_known = 1
+    begin_with_heading(state, math.atan2(forward[1], forward[0]), settings.remembered_heading_std, settings)
     state.heading.given_stamp = state.stamp

@@ -13,7 +13,7 @@ import numpy as np
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.first_fix import START_VELOCITY_STD
-from eskf_ros.filter.alignment.heading import reset_heading
+from eskf_ros.filter.alignment.heading import begin_with_heading, reset_heading
 from eskf_ros.filter.alignment.heading_search import forget_search, turn_found
 from eskf_ros.filter.history.records import XX
 from eskf_ros.filter.inertial.navigation_frame import heading_of
@@ -109,8 +109,7 @@ def update_unknown_heading(state, aid, settings, work):
     found, found_std = turn_found(state)
     if abs(wrapped(turn - found)) > SIGMAS * math.sqrt(std**2 + found_std**2):
         return False
-    reset_heading(state, heading_of(state, settings) + turn, OPEN_STD, settings)
-    state.heading_known = 1
+    begin_with_heading(state, heading_of(state, settings) + turn, OPEN_STD, settings)
     state.mag.heading = heading_of(state, settings)
     return True
 

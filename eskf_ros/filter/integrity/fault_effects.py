@@ -40,18 +40,16 @@ CERTAIN_SHARE = 2.0
 
 @njit
 def write_effect(state, aid, work, settings):
-    """Write the derivative of a measurement by the faults of its receiver to ``work.effect`` (3, 7).
+    """Write the derivative of a GNSS measurement by the faults of its receiver to ``work.direct_effect`` (3, 7).
 
-    It is zero for all streams but GNSS position and velocity, and for the faults of the gyros, which act in time.
+    Zero for the faults of the gyros, which act in time. ``state`` is the predicted one: a velocity that the innovation
+    has corrected would explain this innovation.
     """
-    effect = work.effect
-    for i in range(3):
-        for k in range(FAULTS):
-            effect[i, k] = 0.0
+    work.direct_effect.fill(0.0)
     if aid.stream == Stream.GNSS_POSITION:
-        write_effect_on_position(state, aid.source, effect, settings)
-    elif aid.stream == Stream.GNSS_VELOCITY:
-        write_effect_on_velocity(state, effect)
+        write_effect_on_position(state, aid.source, work.direct_effect, settings)
+    else:
+        write_effect_on_velocity(state, work.direct_effect)
 
 
 @njit

@@ -18,7 +18,6 @@ from eskf_ros.filter.integrity.fault_effects import (
     absorb_completely,
     carry_absorbed,
     certain_share,
-    write_effect,
 )
 from eskf_ros.filter.integrity.heading_corrections import HEADING
 from eskf_ros.filter.integrity.stepwise import best_cause, lost_by_exchange, sweep
@@ -134,14 +133,11 @@ def learn_faults(state, aid, size, gate, work, settings):
     dt = carry_absorbed(state, settings)
     accepted = aid.verdict in (Verdict.FUSED, Verdict.WEIGHED_DOWN)
     for source in range(SOURCES):
-        absorbed = state.installation.absorbed[source]
-        write_effect(state, aid, work, settings)
-        effect = work.effect
+        absorbed, effect = state.installation.absorbed[source], work.effect
         is_own = source == aid.source and aid.stream in (Stream.GNSS_POSITION, Stream.GNSS_VELOCITY)
         for a in range(size):
             for k in range(FAULTS):
-                if not is_own:
-                    effect[a, k] = 0.0
+                effect[a, k] = work.direct_effect[a, k] if is_own else 0.0
                 for i in range(state.error_size):
                     effect[a, k] -= work.jacobian[a, i] * absorbed[i, k]
         if is_own:

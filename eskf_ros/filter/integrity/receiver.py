@@ -14,6 +14,7 @@ import math
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.heading_sensors import confirm_given_heading, reset_to_unknown_heading
 from eskf_ros.filter.history.records import XX, YY
+from eskf_ros.filter.integrity.fault_effects import write_effect
 from eskf_ros.filter.integrity.fix_errors import (
     follow_calm_error,
     forget_spread,
@@ -91,6 +92,7 @@ def fuse_receiver(states, aid, gate, settings, work):
     is_wrong_heading = refute_heading(states, aid, gate, settings, work)
     heard, jumps, believed, humble_nis, humble_log = judge_with_humble_lane(states, aid, gate, settings, work)
     size = linearize(state, aid, settings, work)
+    write_effect(state, aid, work, settings)
     if is_position:
         note_claims(state, aid.source, settings, work)
     for k in range(size):
