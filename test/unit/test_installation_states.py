@@ -115,8 +115,10 @@ def test_an_open_lever_arm_makes_the_position_uncertain_once_the_heading_is_know
     state["optional"][:] = 0.0
     state["covariance"][POSITION : POSITION + 3, :] = 0.0
     state["covariance"][:, POSITION : POSITION + 3] = 0.0
+    state["covariance"][ATTITUDE : ATTITUDE + 3, :] = 0.0
+    state["covariance"][:, ATTITUDE : ATTITUDE + 3] = 0.0
     place = slice(int(ALL["lever_arm_at"]), int(ALL["lever_arm_at"]) + 3)
-    begin_with_heading(state, 1.0, 0.1, ALL)
+    begin_with_heading(state, 1.0, 0.0, ALL)
     covariance = state["covariance"]
     to_map = np.array(to_matrix(state["attitude"])) @ ALL["imu_to_base"].T
     np.testing.assert_allclose(covariance[POSITION : POSITION + 3, place], -0.25 * to_map, atol=1e-12)

@@ -91,35 +91,34 @@ def reset_heading(state, heading, std, settings):
 
 @njit
 def begin_with_heading(state, heading, std, settings):
-    """Set the unknown heading (rad, map), with the standard deviation ``std`` (rad); it is known from now on."""
+    """Set the unknown heading (rad, map), with the standard deviation ``std`` (rad); it is known from now on.
+
+    Fixes have told where the antenna is: the position, antenna - R lever_arm, has its share of the attitude's error.
+    """
     reset_heading(state, heading, std, settings)
     if state.position_known == 1:
+        lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[0])
+        inflate_position(state, ATTITUDE, (0.0, -lever[2], lever[1]))
+        inflate_position(state, ATTITUDE + 1, (lever[2], 0.0, -lever[0]))
+        inflate_position(state, ATTITUDE + 2, (-lever[1], lever[0], 0.0))
         inflate_position_by_antenna(state, settings)
     state.heading_known = 1
 
 
 @njit
 def begin_with_search(state, heading, std, settings):
-    """Set the unknown heading (rad, map), and continue with position and velocity of the search that has found it.
+    """Set the unknown heading (rad, map) that the search has found, and continue with the velocity of the search.
 
     Without a heading the filter knows no accelerations, so its velocity lags behind; the search has used them.
     """
-    reset_heading(state, heading, std, settings)
-    found, covariance = state.search, state.covariance
-    for k in range(2):
-        state.position_map[k] = found.estimate[k]
-        state.velocity_map[k] = found.estimate[2 + k]
+    begin_with_heading(state, heading, std, settings)
+    for i in range(2):
+        state.velocity_map[i] = state.search.estimate[2 + i]
         for j in range(state.error_size):
-            covariance[POSITION + k, j] = covariance[j, POSITION + k] = 0.0
-            covariance[VELOCITY + k, j] = covariance[j, VELOCITY + k] = 0.0
-    for k in range(2):
-        for m in range(2):
-            covariance[POSITION + k, POSITION + m] = found.covariance[k, m]
-            covariance[VELOCITY + k, VELOCITY + m] = found.covariance[2 + k, 2 + m]
-            covariance[POSITION + k, VELOCITY + m] = found.covariance[k, 2 + m]
-            covariance[VELOCITY + m, POSITION + k] = found.covariance[k, 2 + m]
-    inflate_position_by_antenna(state, settings)
-    state.heading_known = 1
+            state.covariance[VELOCITY + i, j] = state.covariance[j, VELOCITY + i] = 0.0
+    for i in range(2):
+        for j in range(2):
+            state.covariance[VELOCITY + i, VELOCITY + j] = state.search.covariance[2 + i, 2 + j]
 
 
 @njit

@@ -114,14 +114,15 @@ def linearize(state, payload, source, settings, work):
     linearize_antenna(state, position_of_fix(state, payload), source, settings, work)
     split_noise(state, source, settings, work)
     add_way_of_cut_stamp(state, source, work)
-    if state.heading_known == 0:
-        add_unknown_lever(state, source, settings, work)
     return SIZE
 
 
 @njit
 def linearize_antenna(state, measured, source, settings, work):
-    """Write innovation and Jacobian of a position (m, map) of the antenna of ``source`` to ``work``, which is clear."""
+    """Write innovation and Jacobian of a position (m, map) of the antenna of ``source`` to ``work``, which is clear.
+
+    While the heading is unknown, the position stands for that of the antenna (`alignment.heading.begin_with_heading`).
+    """
     let_heading_be_held(work, settings)
     predicted = predict(state, source, settings)
     for i in range(3):
@@ -132,14 +133,6 @@ def linearize_antenna(state, measured, source, settings, work):
         set_minus_cross(work.jacobian, ATTITUDE, rotate(rotation, lever_arm_of(state, source, settings)))
         set_lever_arm(work.jacobian, state, rotation, source, False, settings)
         carry_position(state, rotation, source, settings, work)
-
-
-@njit
-def add_unknown_lever(state, source, settings, work):
-    """Add to the noise that the lever arm points anywhere around the vertical while the heading is unknown."""
-    lever = rotate(to_matrix(state.attitude), lever_arm_of(state, source, settings))
-    for i in range(2):
-        work.noise[i, i] += lever[0] ** 2 + lever[1] ** 2
 
 
 def limits(gnss: Any) -> dict[str, Any]:
