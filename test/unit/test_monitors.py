@@ -9,48 +9,34 @@ import numpy as np
 import pytest
 
 from eskf_ros.filter.history.records import AID
-from eskf_ros.filter.integrity.fault_effects import POSITION_TIME, VELOCITY_TIME, write_effect_on_position
+from eskf_ros.filter.integrity.fault_effects import POSITION_TIME, VELOCITY_TIME, write_effect_on_velocity
 from eskf_ros.filter.integrity.fix_errors import update_shares
 from eskf_ros.filter.integrity.heading_monitor import slip_of, watch_slip
 from eskf_ros.filter.integrity.installation_monitor import (
     LASTING_LOOKS,
     find_faults,
-    forget_uncertain_turns,
     learn_faults,
 )
 from eskf_ros.filter.integrity.motion_report import _compared, travel_complaints
 from eskf_ros.filter.integrity.motion_sums import add_push, add_turn
 from eskf_ros.filter.integrity.receiver_report import aid_complaints
 from eskf_ros.filter.state.enums import Stream, Verdict
-from eskf_ros.filter.state.error_state import ATTITUDE, VELOCITY
 from eskf_ros.filter.state.time import NEVER, SECOND
+from eskf_ros.geodesy.rotation import to_matrix
 from support.kernels import make_settings, make_state, make_work
 
 SETTINGS = make_settings()
 
 
-def uncertain(block: int, std: float, **changes: Any) -> Any:
-    """A state whose three errors from index ``block`` on have this standard deviation."""
-    state = make_state(**changes)
-    for i in range(3):
-        state["covariance"][block + i, block + i] = std**2
-    return state
-
-
-@pytest.mark.parametrize(("speed", "known"), [(0.02, 0.0), (0.2, 0.2 * 0.04 / (0.04 + 3e-4)), (20.0, 20.0)])
-def test_a_velocity_within_its_sigma_says_nothing_of_the_time(speed: float, known: float) -> None:
-    effect = np.zeros((3, 7))
-    write_effect_on_position(uncertain(VELOCITY, 0.01, velocity=(speed, 0.0, 0.0)), 0, effect, SETTINGS)
-    assert effect[0, POSITION_TIME] == pytest.approx(known, rel=1e-3, abs=1e-12)
-
-
-def test_a_turn_within_the_sigma_of_the_attitude_says_nothing_of_the_lever_arm() -> None:
-    effect = np.zeros((3, 7))
-    effect[1, 0], effect[0, 1], effect[2, POSITION_TIME] = 0.01, 1.0, 5.0
-    forget_uncertain_turns(uncertain(ATTITUDE, 0.01), effect)
-    assert effect[1, 0] == 0.0
-    assert effect[0, 1] == pytest.approx(1.0, rel=1e-3)
-    assert effect[2, POSITION_TIME] == 5.0
+@pytest.mark.parametrize(("rate", "share"), [(1e-4, 0.0), (0.5, 1.0)])
+def test_a_rate_within_its_noise_says_nothing_of_the_lever_arm(rate: float, share: float) -> None:
+    """The velocity of an antenna 1 m ahead is that to the left, by the rate about the vertical."""
+    state, effect = make_state(), np.zeros((3, 7))
+    state["imu"]["interval"], state["imu"]["smooth_rate"] = 0.01, (0.0, 0.0, rate)
+    state["quality"]["change"][3:] = 1e-3
+    write_effect_on_velocity(state, effect)
+    expected = np.array(to_matrix(state["attitude"]))[:, 1] * rate * share
+    np.testing.assert_allclose(effect[:, 0], expected, rtol=2e-3, atol=2e-4 * share)
 
 
 def travelled(angles_deg: Any) -> Any:

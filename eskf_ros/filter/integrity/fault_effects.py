@@ -35,7 +35,7 @@ GYRO_DRIFT = 6
 """Index of the steady drift of the bias of the gyros about the vertical among the faults."""
 
 CERTAIN_SHARE = 2.0
-"""Ratio of the square of an acceleration or a rate to its variance below which it says nothing of the faults."""
+"""Ratio of the square of a rate to its variance below which it says nothing of the lever arm."""
 
 
 @njit
@@ -54,57 +54,36 @@ def write_effect(state, aid, work, settings):
 
 @njit
 def write_effect_on_position(state, source, effect, settings):
-    """Write the derivative of a position by the faults of its receiver to the first rows of ``effect``.
-
-    A velocity that is not larger than its own uncertainty says nothing of the time: at rest it is what the errors of
-    the fixes have made of it, and would explain them.
-    """
+    """Write the derivative of a position by the faults of its receiver to the first rows of ``effect``."""
     rotation = to_matrix(state.attitude)
-    velocity, unknown = state.velocity_map, 0.0
-    for i in range(3):
-        unknown += state.covariance[VELOCITY + i, VELOCITY + i]
-    square = velocity[0] * velocity[0] + velocity[1] * velocity[1] + velocity[2] * velocity[2]
-    share = certain_share(square, unknown)
     turning = rotate(rotation, cross(smoothed_rate(state, rotation), settings.lever_arms_body[source]))
     for i in range(3):
         for k in range(3):
             effect[i, k] = rotation[i][k]
-        effect[i, POSITION_TIME] = share * velocity[i] + turning[i]
+        effect[i, POSITION_TIME] = state.velocity_map[i] + turning[i]
 
 
 @njit
 def write_effect_on_velocity(state, effect):
     """Write the derivative of a velocity by the faults of its receiver to the first rows of ``effect``.
 
-    An acceleration that is not larger than what tilt and bias leave unknown of it says nothing: it would be explained
-    by the same errors as the innovation. Neither does a rate that is not larger than its own noise and vibration.
+    A rate that is not larger than its own noise and vibration says nothing of the lever arm: it would explain the
+    innovation, which has them too.
     """
     rotation = to_matrix(state.attitude)
     rate = smoothed_rate(state, rotation)
+    noise = 3.0 * shaken_density(state.quality, 3, state.imu.interval) ** 2 / (2.0 * SMOOTHING_TIME)
+    square = dot(rate, rate)
+    turning = square / (square + noise) if square > CERTAIN_SHARE * noise else 0.0
     force, bias = state.imu.smooth_force, state.accel_bias
     felt = rotate(rotation, (force[0] - bias[0], force[1] - bias[1], force[2] - bias[2]))
     gravity = gravity_map(state, (state.position_map[0], state.position_map[1], state.position_map[2]))
-    acceleration = (felt[0] + gravity[0], felt[1] + gravity[1], felt[2] + gravity[2])
-    unknown = dot(gravity, gravity) * (
-        state.covariance[ATTITUDE, ATTITUDE] + state.covariance[ATTITUDE + 1, ATTITUDE + 1]
-    )
-    for i in range(3):
-        unknown += state.covariance[ACCEL_BIAS + i, ACCEL_BIAS + i]
-    share = certain_share(dot(acceleration, acceleration), unknown)
-    rate_noise = shaken_density(state.quality, 3, state.imu.interval) ** 2 / (2.0 * SMOOTHING_TIME)
-    turning = certain_share(dot(rate, rate), 3.0 * rate_noise)
     x = rotate(rotation, cross(rate, (1.0, 0.0, 0.0)))
     y = rotate(rotation, cross(rate, (0.0, 1.0, 0.0)))
     z = rotate(rotation, cross(rate, (0.0, 0.0, 1.0)))
     for i in range(3):
         effect[i, 0], effect[i, 1], effect[i, 2] = turning * x[i], turning * y[i], turning * z[i]
-        effect[i, VELOCITY_TIME] = share * acceleration[i]
-
-
-@njit
-def certain_share(square, unknown):
-    """Return the share of a vector, given its square, that is not its own error of a variance ``unknown``."""
-    return square / (square + unknown) if square > CERTAIN_SHARE * unknown else 0.0
+        effect[i, VELOCITY_TIME] = felt[i] + gravity[i]
 
 
 @njit

@@ -17,12 +17,11 @@ from eskf_ros.filter.integrity.fault_effects import (
     VELOCITY_TIME,
     absorb_completely,
     carry_absorbed,
-    certain_share,
 )
 from eskf_ros.filter.integrity.heading_corrections import HEADING
 from eskf_ros.filter.integrity.stepwise import best_cause, lost_by_exchange, sweep
 from eskf_ros.filter.state.enums import Stream, Verdict
-from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_CAPACITY, ERROR_SIZE, SOURCES
+from eskf_ros.filter.state.error_state import ERROR_CAPACITY, ERROR_SIZE, SOURCES
 from eskf_ros.filter.state.time import NEVER, SECOND
 
 LEARNING_HEADING_STD = 0.35
@@ -141,8 +140,6 @@ def learn_faults(state, aid, size, gate, work, settings):
                 for i in range(state.error_size):
                     effect[a, k] -= work.jacobian[a, i] * absorbed[i, k]
         if is_own:
-            if aid.stream == Stream.GNSS_POSITION:
-                forget_uncertain_turns(state, work.effect)
             weigh_faults(state, source, dt, min(1.0, gate / max(aid.nis, 1e-9)), work)
         if accepted:
             for i in range(state.error_size):
@@ -150,22 +147,6 @@ def learn_faults(state, aid, size, gate, work, settings):
                     for a in range(size):
                         absorbed[i, k] += work.gain[i, a] * effect[a, k]
         update_considered(state, source)
-
-
-@njit
-def forget_uncertain_turns(state, effect):
-    """Take the lever arm out of ``effect`` where it shows by a turn that is not larger than the error of the attitude.
-
-    An attitude that is corrected turns the lever arm in the estimate alone.
-    """
-    unknown = 0.0
-    for i in range(3):
-        unknown += state.covariance[ATTITUDE + i, ATTITUDE + i]
-    for k in range(3):
-        square = effect[0, k] ** 2 + effect[1, k] ** 2 + effect[2, k] ** 2
-        share = certain_share(square, unknown)
-        for a in range(3):
-            effect[a, k] *= share
 
 
 @njit
