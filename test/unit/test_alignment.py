@@ -327,7 +327,7 @@ def test_the_filter_goes_on_with_the_velocity_of_the_search_that_has_found_the_h
     before, block = copy_of(state), random_covariance(1, [0.2, 0.3])
     state["search"]["estimate"][:4] = found = np.array([101.0, 49.0, 8.5, 2.5])
     state["search"]["covariance"][2:4, 2:4] = block
-    heading_start.begin_with_search(state, 0.3, 0.05, make_settings())
+    heading_start.reset_to_search(state, 0.3, 0.05, make_settings())
     assert state["heading_known"] == 1
     np.testing.assert_array_equal(state["velocity_map"], [*found[2:], 0.5])
     np.testing.assert_array_equal(core(state)[3:5, 3:5], block)

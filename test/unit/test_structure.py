@@ -46,7 +46,7 @@ FLOORS = (
 
 WRITERS = {
     "alignment/first_fix.py": {"reset_position_to_fix", "reset_pose"},
-    "alignment/heading.py": {"begin_with_search", "inflate_position", "reset_heading"},
+    "alignment/heading.py": {"inflate_position", "reset_heading", "reset_to_search"},
     "alignment/heading_sensors.py": {"reset_given_heading", "reset_to_unknown_heading"},
     "alignment/levelling.py": {"reset_tilt", "update_gyro_bias_at_rest", "reset_level_to_moving"},
     "inertial/covariance.py": {"propagate_noise", "propagate_axis_noise", "propagate_covariance", "update_error_axes"},

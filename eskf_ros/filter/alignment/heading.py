@@ -106,7 +106,7 @@ def begin_with_heading(state, heading, std, settings):
 
 
 @njit
-def begin_with_search(state, heading, std, settings):
+def reset_to_search(state, heading, std, settings):
     """Set the unknown heading (rad, map) that the search has found, and continue with the velocity of the search.
 
     Without a heading the filter knows no accelerations, so its velocity lags behind; the search has used them.
@@ -192,7 +192,7 @@ def search_with(state, first, measured, lever, gate, settings, work):
         begin_search(state, measured[0], measured[1], max(work.noise[0, 0], work.noise[1, 1]) + reach)
     turn, std = turn_found(state)
     if std <= settings.found_heading_std:
-        begin_with_search(state, heading_of(state, settings) + turn, std, settings)
+        reset_to_search(state, heading_of(state, settings) + turn, std, settings)
     elif settings.use_course == 1:
         align_to_course(state, settings)
 
@@ -213,7 +213,7 @@ def align_to_course(state, settings):
         state.search.course_since = state.stamp
     speed = math.hypot(state.search.estimate[2], state.search.estimate[3])
     if (state.stamp - state.search.course_since) * 1e-9 * speed >= COURSE_WAY:
-        begin_with_search(state, heading, std, settings)
+        reset_to_search(state, heading, std, settings)
 
 
 @njit
