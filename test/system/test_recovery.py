@@ -98,6 +98,15 @@ def test_after_an_outage_fewer_fixes_than_a_cluster_do_not_win(length: float, re
     assert outcome.recovery < (2.0 if resets == 0 else 7.0)
 
 
+@pytest.mark.parametrize("seed", SEEDS)
+def test_fixes_that_have_drawn_the_filter_away_are_followed_when_they_come_back(seed: int) -> None:
+    """40 s of a walk of 1 m/s that no velocity contradicts: the filter is with the fixes within seconds of its end."""
+    case = Case("away", 40.0, (Spoofing(BEGIN, 40.0, (1.0, 0.0, 0.0), 0.1),))
+    outcome, _, navigator = run_case(case, seed, POSITION_ONLY)
+    assert navigator.takeovers > 0
+    assert outcome.recovery < 4.0
+
+
 def test_agreeing_fixes_that_contradict_the_velocity_do_not_win() -> None:
     """Half a minute of fixes in one line, far away, and their velocities say that they should stand still there."""
     episodes = (

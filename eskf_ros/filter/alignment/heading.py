@@ -91,16 +91,9 @@ def reset_heading(state, heading, std, settings):
 
 @njit
 def begin_with_heading(state, heading, std, settings):
-    """Set the unknown heading (rad, map), with the standard deviation ``std`` (rad); it is known from now on.
-
-    Fixes have told where the antenna is: the position, antenna - R lever_arm, has its share of the attitude's error.
-    """
+    """Set the unknown heading (rad, map), with the standard deviation ``std`` (rad); it is known from now on."""
     reset_heading(state, heading, std, settings)
     if state.position_known == 1:
-        lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[0])
-        inflate_position(state, ATTITUDE, (0.0, -lever[2], lever[1]))
-        inflate_position(state, ATTITUDE + 1, (lever[2], 0.0, -lever[0]))
-        inflate_position(state, ATTITUDE + 2, (-lever[1], lever[0], 0.0))
         inflate_position_by_antenna(state, settings)
     state.heading_known = 1
 
@@ -123,12 +116,16 @@ def reset_to_search(state, heading, std, settings):
 
 @njit
 def inflate_position_by_antenna(state, settings):
-    """Give the position its share of the errors of lever arm and time offset, where they are estimated.
+    """Give the position its share of the errors of the attitude, and of lever arm and time offset, where estimated.
 
     With an unknown heading fixes did not enter through them: what is known as well as the fixes is the antenna. From
     now on it is p = antenna - R lever_arm - velocity time_offset, in the covariance, too.
     """
     rotation = to_matrix(state.attitude)
+    lever = rotate(rotation, settings.lever_arms_body[0])
+    inflate_position(state, ATTITUDE, (0.0, -lever[2], lever[1]))
+    inflate_position(state, ATTITUDE + 1, (lever[2], 0.0, -lever[0]))
+    inflate_position(state, ATTITUDE + 2, (-lever[1], lever[0], 0.0))
     if settings.lever_arm_at < state.error_size:
         for k in range(3):
             m = settings.imu_to_base

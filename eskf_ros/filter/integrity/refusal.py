@@ -177,7 +177,10 @@ def rival_offset(state):
 def patience_for(state, stream, source):
     """Return the time (ns) for which offsets that stay the same must last: as long as the stream was believed before.
 
-    Right after an outage or a start there is little that speaks against them.
+    Right after an outage or a start there is little that speaks against them. Nor is there where the IMU is doubted and
+    no velocity backs it: positions may have drawn the filter away, and be back.
     """
+    if state.doubt > 0.0 and not is_live(state, other_stream(stream), source):
+        return SHORT_PATIENCE
     support = state.streams.fused_stamp[stream, source] - state.streams.fused_since[stream, source]
     return min(max(support, SHORT_PATIENCE), LONG_PATIENCE)
