@@ -87,7 +87,7 @@ class Fault:
     given_heading_std_deg: float = 0.0
     """Standard deviation of the heading at the start that the filter is given; 0: it is given none."""
     given_heading_off_deg: float | None = None
-    """How far that heading is off; None: at random, as far as the standard deviation says."""
+    """How far that heading is off; None: by quantiles in turn, as far as the standard deviation says."""
     is_version: bool = False
     """It is a fault of the city drives, on another vehicle."""
     is_steady: bool = False

@@ -202,6 +202,7 @@ WORK = np.dtype(
         ("jacobian", "f8", (3, ERROR_CAPACITY)),
         ("innovation", "f8", (3,)),
         ("noise", "f8", (3, 3)),
+        ("lever_noise", "f8"),
         ("direct_effect", "f8", (3, FAULTS)),
         ("effect", "f8", (3, FAULTS)),
         ("fault_fit", "f8", (FAULTS + 1, FAULTS + 1)),
@@ -241,6 +242,7 @@ WORK = np.dtype(
   zero unless the measurement writes it; ``holds_heading``: 1 for GNSS, which shows the heading by accelerations
   alone, and with it the error at ``heading_offset_at``.
 - ``projected`` ... ``correction``: intermediate results of the update.
+- ``lever_noise``: part of the noise of a fix that is the lever arm of an unknown heading (m2, on two axes of map).
 - ``direct_effect``: derivative of the measurement by the faults of its receiver, ``effect``: that of its innovation,
   which the estimate has in part absorbed; ``fault_fit``, ``is_chosen``: normal
   equations of these, and the ones that are estimated (`installation_monitor`, `stepwise`).

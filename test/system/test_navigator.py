@@ -96,6 +96,17 @@ def test_while_heading_is_unknown_position_is_fused_and_yaw_variance_is_a_half_t
     assert np.median(sigma) < 2.0
 
 
+def test_a_long_lever_arm_of_unknown_heading_is_no_error_that_lasts():
+    """Fixes change from one to the next as they claim, wherever the antenna is."""
+    resting = simulate("stand:60", seed=1, imu_rate=100.0, gnss_rate=5.0, lever_arm=(2.5, 0.0, 1.0))
+    navigator, _ = run(resting)
+    state = navigator.state[0]
+    assert state["heading_known"] == 0
+    assert state["scatter"]["pairs"][0] > 200
+    assert state["scatter"]["calm"][0] == 0.0
+    assert not any("errors last" in note for note in navigator.notes)
+
+
 @pytest.mark.parametrize("heading_deg", [None, 35.0])
 def test_heading_from_course_or_parameter(recording, heading_deg):
     mapping = {} if heading_deg is None else {"alignment.initial_heading_deg": heading_deg}

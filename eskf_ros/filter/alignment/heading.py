@@ -16,6 +16,7 @@ from eskf_ros.filter.inertial.navigation_frame import (
     local_up,
     reset_attitude,
 )
+from eskf_ros.filter.measurements.antenna import lever_arm_of
 from eskf_ros.filter.measurements.gnss_position import position_of_fix
 from eskf_ros.filter.measurements.jacobians import set_east_north_up_covariance
 from eskf_ros.filter.state.enums import Stream
@@ -67,7 +68,7 @@ def reset_heading(state, heading, std, settings):
     The error of the heading is uncorrelated with all others afterwards.
     """
     up = local_up(state)
-    lever = rotate(to_matrix(state.attitude), settings.lever_arms_body[0])
+    lever = rotate(to_matrix(state.attitude), lever_arm_of(state, 0, settings))
     change = heading - heading_of(state, settings)
     reset_attitude(state, (change * up[0], change * up[1], change * up[2]))
     # The vehicle did not make this turn: the error of the magnetic field stays the same.
@@ -84,7 +85,7 @@ def reset_heading(state, heading, std, settings):
             covariance[ATTITUDE + i, ATTITUDE + j] += up[i] * up[j] * std**2
     if state.position_known == 1:
         # GNSS has measured the antenna, which therefore stays in place: the IMU moves about it.
-        turned = rotate(to_matrix(state.attitude), settings.lever_arms_body[0])
+        turned = rotate(to_matrix(state.attitude), lever_arm_of(state, 0, settings))
         for i in range(3):
             state.position_map[i] += lever[i] - turned[i]
 
@@ -104,7 +105,6 @@ def reset_to_search(state, heading, std, settings):
 
     Without a heading the filter knows no accelerations, so its velocity lags behind; the search has used them.
     """
-    begin_with_heading(state, heading, std, settings)
     for i in range(2):
         state.velocity_map[i] = state.search.estimate[2 + i]
         for j in range(state.error_size):
@@ -112,6 +112,7 @@ def reset_to_search(state, heading, std, settings):
     for i in range(2):
         for j in range(2):
             state.covariance[VELOCITY + i, VELOCITY + j] = state.search.covariance[2 + i, 2 + j]
+    begin_with_heading(state, heading, std, settings)
 
 
 @njit
@@ -122,7 +123,7 @@ def inflate_position_by_antenna(state, settings):
     now on it is p = antenna - R lever_arm - velocity time_offset, in the covariance, too.
     """
     rotation = to_matrix(state.attitude)
-    lever = rotate(rotation, settings.lever_arms_body[0])
+    lever = rotate(rotation, lever_arm_of(state, 0, settings))
     inflate_position(state, ATTITUDE, (0.0, -lever[2], lever[1]))
     inflate_position(state, ATTITUDE + 1, (lever[2], 0.0, -lever[0]))
     inflate_position(state, ATTITUDE + 2, (-lever[1], lever[0], 0.0))

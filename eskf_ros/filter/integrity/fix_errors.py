@@ -16,7 +16,7 @@ from eskf_ros.compiled import njit
 from eskf_ros.filter.integrity.fault_effects import FAULTS
 from eskf_ros.filter.integrity.installation_monitor import LEAST_INTERVAL
 from eskf_ros.filter.integrity.scatter import FEWEST_PAIRS, LARGEST_SPREAD, NOTABLE_SCATTER
-from eskf_ros.filter.measurements.gnss_position import LEAST_WHITE, noise_shares
+from eskf_ros.filter.measurements.gnss_position import LEAST_WHITE, claimed_noise, noise_shares
 from eskf_ros.filter.state.augmented_states import reset_augmented, update_error_size
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ERROR_SIZE, NOWHERE, POSITION, SOURCES
@@ -199,7 +199,7 @@ def note_claims(state, source, settings, work):
     """Note the variances that the fix in ``work`` claims."""
     white, _ = noise_shares(state, source, settings)
     for i in range(3):
-        state.scatter.claimed[source, i] = work.noise[i, i] / white
+        state.scatter.claimed[source, i] = claimed_noise(work, i) / white
 
 
 @njit

@@ -159,6 +159,13 @@ def is_other_agreeing(state, stream, source):
 
 
 @njit
+def has_velocity(state, stream, source):
+    """Say whether velocities come beside the positions of a receiver: its own, of wheels, or in body axes."""
+    is_carried = is_live(state, Stream.WHEEL.value, 0) or is_live(state, Stream.BODY_VELOCITY.value, 0)
+    return is_carried or is_live(state, other_stream(stream), source)
+
+
+@njit
 def rival_offset(state):
     """Return how far (m; x and y of map) fixes that are refused, but agree with each other, are from the estimate.
 
@@ -177,10 +184,10 @@ def rival_offset(state):
 def patience_for(state, stream, source):
     """Return the time (ns) for which offsets that stay the same must last: as long as the stream was believed before.
 
-    Right after an outage or a start there is little that speaks against them. Nor is there where the IMU is doubted and
-    no velocity backs it: positions may have drawn the filter away, and be back.
+    Right after an outage or a start there is little that speaks against them. Nor is there against positions where the
+    IMU is doubted and no velocity backs it: they may have drawn the filter away, and be back.
     """
-    if state.doubt > 0.0 and not is_live(state, other_stream(stream), source):
+    if kind_of(stream) == 0 and state.doubt > 0.0 and not has_velocity(state, stream, source):
         return SHORT_PATIENCE
     support = state.streams.fused_stamp[stream, source] - state.streams.fused_since[stream, source]
     return min(max(support, SHORT_PATIENCE), LONG_PATIENCE)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.measurements.gnss_position import noise_shares
+from eskf_ros.filter.measurements.gnss_position import claimed_noise, noise_shares
 from eskf_ros.filter.measurements.gnss_velocity import noise_factor
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.error_state import ERROR_SIZE, POSITION, SOURCES, VELOCITY
@@ -139,7 +139,7 @@ def learn_from_change(state, lane, source, is_fused, settings, work):
     dt = (state.stamp - scatter.last_stamp[source]) * 1e-9
     change, is_wide = 0.0, False
     for i in range(3):
-        noise, drift = work.noise[i, i], lane.covariance[VELOCITY + i, VELOCITY + i] * dt * dt
+        noise, drift = claimed_noise(work, i), lane.covariance[VELOCITY + i, VELOCITY + i] * dt * dt
         difference = error_change(lane, scatter.last_residual[source], i, is_fused, settings, work)
         change += difference * difference / (2.0 * noise + drift) / 3.0
         is_wide |= drift > noise / used

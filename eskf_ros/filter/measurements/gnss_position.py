@@ -114,15 +114,14 @@ def linearize(state, payload, source, settings, work):
     linearize_antenna(state, position_of_fix(state, payload), source, settings, work)
     split_noise(state, source, settings, work)
     add_way_of_cut_stamp(state, source, work)
+    if state.heading_known == 0:
+        add_unknown_lever(state, source, settings, work)
     return SIZE
 
 
 @njit
 def linearize_antenna(state, measured, source, settings, work):
-    """Write innovation and Jacobian of a position (m, map) of the antenna of ``source`` to ``work``, which is clear.
-
-    While the heading is unknown, the position stands for that of the antenna (`alignment.heading.begin_with_heading`).
-    """
+    """Write innovation and Jacobian of a position (m, map) of the antenna of ``source`` to ``work``, which is clear."""
     let_heading_be_held(work, settings)
     predicted = predict(state, source, settings)
     for i in range(3):
@@ -133,6 +132,24 @@ def linearize_antenna(state, measured, source, settings, work):
         set_minus_cross(work.jacobian, ATTITUDE, rotate(rotation, lever_arm_of(state, source, settings)))
         set_lever_arm(work.jacobian, state, rotation, source, False, settings)
         carry_position(state, rotation, source, settings, work)
+
+
+@njit
+def add_unknown_lever(state, source, settings, work):
+    """Add to the noise that the lever arm points anywhere around the vertical while the heading is unknown.
+
+    It turns with the body, and is another one for a second antenna, but it is not new with each fix.
+    """
+    lever = rotate(to_matrix(state.attitude), lever_arm_of(state, source, settings))
+    work.lever_noise = lever[0] ** 2 + lever[1] ** 2
+    for i in range(2):
+        work.noise[i, i] += work.lever_noise
+
+
+@njit
+def claimed_noise(work, i):
+    """Return the part of the variance (m2, axis ``i`` of map) of the fix in ``work`` that is new with each fix."""
+    return work.noise[i, i] - work.lever_noise if i < 2 else work.noise[i, i]
 
 
 def limits(gnss: Any) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix
 def clear(work):
     """Zero Jacobian, noise, and the covariance of noise and errors (``work.shared``), and do not hold the heading."""
     work.holds_heading = 0
+    work.lever_noise = 0.0
     for i in range(3):
         for j in range(ERROR_CAPACITY):
             work.jacobian[i, j] = 0.0

@@ -104,7 +104,11 @@ def write_odometry(state, local, settings, row):
         row.accel_bias_std[i] = math.sqrt(max(covariance[ACCEL_BIAS + i, ACCEL_BIAS + i], 0.0))
         row.gyro_bias_std[i] = math.sqrt(max(covariance[GYRO_BIAS + i, GYRO_BIAS + i], 0.0))
     write_local_pose(state, local, attitude, settings, row)
-    write_pose_covariance(state, imu_offset, row)
+    if state.heading_known == 1:
+        write_pose_covariance(state, imu_offset, row)
+    else:
+        write_pose_covariance(state, (0.0, 0.0, 0.0), row)
+        add_unknown_heading(state, imu_offset, settings, row)
     write_twist_covariance(state, base_to_map, settings, row)
     for source in range(SOURCES):
         if state.installation.is_considered[source] == 1:
@@ -118,8 +122,6 @@ def write_odometry(state, local, settings, row):
         for i in range(3):
             for j in range(3):
                 row.pose_covariance[i, j] += lag * lag * velocity[i] * velocity[j]
-    if state.heading_known == 0:
-        add_unknown_heading(state, imu_offset, settings, row)
 
 
 @njit
@@ -240,8 +242,8 @@ def add_considered_faults(state, source, imu_offset, base_to_map, row):
 def add_unknown_heading(state, imu_offset, settings, row):
     """Add what an unknown heading does to the position of base_link, since GNSS measures that of the antenna.
 
-    The horizontal arm l from base_link to the antenna points anywhere: E |R(a) l - R(b) l|^2 = 2 |l|^2 for a uniform
-    angle a, |l|^2 for each axis.
+    The horizontal arm l from base_link to the antenna, not that to the IMU, points anywhere:
+    E |R(a) l - R(b) l|^2 = 2 |l|^2 for a uniform angle a, |l|^2 for each axis.
     """
     antenna = rotate(to_matrix(state.attitude), settings.lever_arms_body[0])
     arm_squared = (antenna[0] + imu_offset[0]) ** 2 + (antenna[1] + imu_offset[1]) ** 2
