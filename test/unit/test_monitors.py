@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from eskf_ros.filter.history.records import AID
+from eskf_ros.filter.inertial.strapdown import gravity_map
 from eskf_ros.filter.integrity.fault_effects import POSITION_TIME, VELOCITY_TIME, write_effect_on_velocity
 from eskf_ros.filter.integrity.fix_errors import update_shares
 from eskf_ros.filter.integrity.heading_monitor import slip_of, watch_slip
@@ -37,6 +38,18 @@ def test_a_rate_within_its_noise_says_nothing_of_the_lever_arm(rate: float, shar
     write_effect_on_velocity(state, effect)
     expected = np.array(to_matrix(state["attitude"]))[:, 1] * rate * share
     np.testing.assert_allclose(effect[:, 0], expected, rtol=2e-3, atol=2e-4 * share)
+
+
+@pytest.mark.parametrize(("acceleration", "share"), [(1e-3, 0.0), (3.0, 1.0)])
+def test_an_acceleration_within_vibration_says_nothing_of_the_time(acceleration: float, share: float) -> None:
+    state, effect = make_state(), np.zeros((3, 7))
+    to_map = np.array(to_matrix(state["attitude"]))
+    forward = to_map[:, 0]
+    gravity = np.array(gravity_map(state, tuple(state["position_map"])))
+    state["imu"]["interval"], state["imu"]["smooth_force"] = 0.01, to_map.T @ (acceleration * forward - gravity)
+    state["quality"]["change"][:3] = 1e-3
+    write_effect_on_velocity(state, effect)
+    np.testing.assert_allclose(effect[:, VELOCITY_TIME], acceleration * share * forward, rtol=2e-3, atol=1e-9)
 
 
 def travelled(angles_deg: Any) -> Any:

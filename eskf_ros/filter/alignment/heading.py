@@ -57,6 +57,9 @@ WIND = 5.0
 LEAST_LENGTH = 0.5
 """Length of the found (cos, sin) along the course, at least; 1 if the model holds."""
 
+SAME_VELOCITY = 13.82
+"""NIS of the difference of the velocities of filter and search up to which they agree: 0.999 quantile of chi-square."""
+
 COURSE_SEARCH_STD = 0.2
 """rad; standard deviation of the direction found by the search above which the course is not believed."""
 
@@ -103,15 +106,22 @@ def begin_with_heading(state, heading, std, settings):
 def reset_to_search(state, heading, std, settings):
     """Set the unknown heading (rad, map) that the search has found, and continue with the velocity of the search.
 
-    Without a heading the filter knows no accelerations, so its velocity lags behind; the search has used them.
+    Without a heading the filter knows no accelerations, so its velocity lags behind; the search has used them. A search
+    that is further from it than both may err has gone astray.
     """
-    for i in range(2):
-        state.velocity_map[i] = state.search.estimate[2 + i]
-        for j in range(state.error_size):
-            state.covariance[VELOCITY + i, j] = state.covariance[j, VELOCITY + i] = 0.0
-    for i in range(2):
-        for j in range(2):
-            state.covariance[VELOCITY + i, VELOCITY + j] = state.search.covariance[2 + i, 2 + j]
+    x, y = state.search.estimate[2] - state.velocity_map[0], state.search.estimate[3] - state.velocity_map[1]
+    p, found = state.covariance, state.search.covariance
+    xx = p[VELOCITY, VELOCITY] + found[2, 2]
+    xy = p[VELOCITY, VELOCITY + 1] + found[2, 3]
+    yy = p[VELOCITY + 1, VELOCITY + 1] + found[3, 3]
+    if yy * x * x - 2.0 * xy * x * y + xx * y * y <= SAME_VELOCITY * (xx * yy - xy * xy):
+        for i in range(2):
+            state.velocity_map[i] = state.search.estimate[2 + i]
+            for j in range(state.error_size):
+                p[VELOCITY + i, j] = p[j, VELOCITY + i] = 0.0
+        for i in range(2):
+            for j in range(2):
+                p[VELOCITY + i, VELOCITY + j] = found[2 + i, 2 + j]
     begin_with_heading(state, heading, std, settings)
 
 

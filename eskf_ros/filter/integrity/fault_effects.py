@@ -35,7 +35,7 @@ GYRO_DRIFT = 6
 """Index of the steady drift of the bias of the gyros about the vertical among the faults."""
 
 CERTAIN_SHARE = 2.0
-"""Ratio of the square of a rate to its variance below which it says nothing of the lever arm."""
+"""Ratio of the square of a rate or an acceleration to its variance below which it says nothing of the faults."""
 
 
 @njit
@@ -67,23 +67,33 @@ def write_effect_on_position(state, source, effect, settings):
 def write_effect_on_velocity(state, effect):
     """Write the derivative of a velocity by the faults of its receiver to the first rows of ``effect``.
 
-    A rate that is not larger than its own noise and vibration says nothing of the lever arm: it would explain the
-    innovation, which has them too.
+    A rate that is not larger than its own noise and vibration says nothing of the lever arm, nor does such an
+    acceleration of the time: they would explain the innovation, which has the vibration, too.
     """
     rotation = to_matrix(state.attitude)
     rate = smoothed_rate(state, rotation)
-    noise = 3.0 * shaken_density(state.quality, 3, state.imu.interval) ** 2 / (2.0 * SMOOTHING_TIME)
-    square = dot(rate, rate)
-    turning = square / (square + noise) if square > CERTAIN_SHARE * noise else 0.0
+    turning = shown_share(state, 3, dot(rate, rate))
     force, bias = state.imu.smooth_force, state.accel_bias
     felt = rotate(rotation, (force[0] - bias[0], force[1] - bias[1], force[2] - bias[2]))
     gravity = gravity_map(state, (state.position_map[0], state.position_map[1], state.position_map[2]))
+    acceleration = (felt[0] + gravity[0], felt[1] + gravity[1], felt[2] + gravity[2])
+    pushing = shown_share(state, 0, dot(acceleration, acceleration))
     x = rotate(rotation, cross(rate, (1.0, 0.0, 0.0)))
     y = rotate(rotation, cross(rate, (0.0, 1.0, 0.0)))
     z = rotate(rotation, cross(rate, (0.0, 0.0, 1.0)))
     for i in range(3):
         effect[i, 0], effect[i, 1], effect[i, 2] = turning * x[i], turning * y[i], turning * z[i]
-        effect[i, VELOCITY_TIME] = felt[i] + gravity[i]
+        effect[i, VELOCITY_TIME] = pushing * acceleration[i]
+
+
+@njit
+def shown_share(state, first, square):
+    """Return the share of a smoothed reading, given its ``square``, that is neither noise nor vibration of its sensor.
+
+    ``first``: 0 for the accelerometers, 3 for the gyros (`sample_doubt.shaken_density`).
+    """
+    noise = 3.0 * shaken_density(state.quality, first, state.imu.interval) ** 2 / (2.0 * SMOOTHING_TIME)
+    return square / (square + noise) if square > CERTAIN_SHARE * noise else 0.0
 
 
 @njit
