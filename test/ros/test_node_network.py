@@ -131,7 +131,7 @@ from eskf_ros.ros_node import main, node
 class Stalled(node.EskfNode):
     def __init__(self, **options):
         super().__init__(**options)
-        self.create_subscription(Empty, "stall", lambda message: time.sleep(1.8), 1)
+        self.create_subscription(Empty, "stall", lambda message: time.sleep(1.5), 1)
 
 node.EskfNode = Stalled
 sys.exit(main.main())
@@ -139,7 +139,7 @@ sys.exit(main.main())
 
 
 def test_no_sample_is_lost_while_the_node_is_busy_elsewhere(ros, tmp_path: Path):
-    """Nine hundred samples come while a callback takes its time, on subscriptions as they are by default."""
+    """750 samples come while a callback takes its time, on subscriptions as they are by default, which hold 1000."""
     from std_msgs.msg import Empty
 
     script = tmp_path / "stalled.py"
