@@ -184,7 +184,7 @@ def run(recording: Recording, navigator: Navigator, interval: float = 0.5) -> Ru
 
 
 def published_covariance(states: np.void | NDArray[Any]) -> Array:
-    """Return the covariances of one state or of many (...,), with what odometry adds.
+    """Return the covariances of one state or of many (...,), with what odometry adds where the heading is known.
 
     That is lasting errors of fixes, the effect of faults of the installation, and that of clocks that are apart.
     """

@@ -337,6 +337,17 @@ def test_the_filter_goes_on_with_the_velocity_of_the_search_that_has_found_the_h
     assert conditioned_eigenvalues(core(state)).min() > 0.0
 
 
+def test_a_search_that_has_gone_astray_does_not_give_the_velocity() -> None:
+    """Its velocity is 5 m/s away from that of the filter, which the fixes have told to 0.3 m/s."""
+    state = driving((8.0, 3.0, 0.5), np.diag([0.04, 0.09]))
+    before = copy_of(state)
+    state["search"]["estimate"][2:4] = 3.0, 3.0
+    heading_start.reset_to_search(state, 0.3, 0.05, make_settings())
+    assert state["heading_known"] == 1
+    np.testing.assert_array_equal(state["velocity_map"], before["velocity_map"])
+    np.testing.assert_array_equal(core(state)[3:5, 3:5], core(before)[3:5, 3:5])
+
+
 @seeds
 def test_a_found_heading_leaves_the_antenna_as_certain_as_it_was(seed: int) -> None:
     """Fixes have told where the antenna is; the position is antenna - R lever_arm, whatever the attitude is."""

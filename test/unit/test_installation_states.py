@@ -16,6 +16,7 @@ from eskf_ros.filter.alignment.heading import begin_with_heading
 from eskf_ros.filter.alignment.levelling import reset_tilt
 from eskf_ros.filter.integrity.humble_lane import size_for_gnss
 from eskf_ros.filter.measurements.antenna import antenna_velocity, lever_arm_of, time_offset_of
+from eskf_ros.filter.measurements.gnss_position import predict
 from eskf_ros.filter.predict import step
 from eskf_ros.filter.state.augmented_states import update_error_size
 from eskf_ros.filter.state.enums import Stream
@@ -127,6 +128,17 @@ def test_an_open_lever_arm_makes_the_position_uncertain_once_the_heading_is_know
     # What is left is the way that the time offset may stand for.
     velocity = np.array(state["velocity_map"])
     np.testing.assert_allclose(antenna, np.outer(velocity, velocity) * 0.1**2, atol=1e-9)
+
+
+def test_an_estimated_lever_arm_counts_when_a_heading_is_set() -> None:
+    """What was found of the arm before the heading was lost is still there: the antenna stays in its place."""
+    state = active(2)
+    state["position_known"] = 1
+    place = int(ALL["lever_arm_at"]) - ERROR_SIZE
+    state["optional"][place : place + 3] = 0.3, -0.2, 0.1
+    before = np.array(predict(state, 0, ALL))
+    begin_with_heading(state, 1.0, 0.1, ALL)
+    np.testing.assert_allclose(predict(state, 0, ALL), before, rtol=0.0, atol=1e-9)
 
 
 def test_scales_of_accelerometers_have_tilted_the_level() -> None:

@@ -11,6 +11,7 @@ from eskf_ros.filter.alignment.levelling import UNKNOWN_SPEED
 from eskf_ros.filter.inertial.navigation_frame import body_rate, heading_of
 from eskf_ros.filter.integrity.fix_errors import held_variance
 from eskf_ros.filter.integrity.motion_monitor import offset_by_jumps
+from eskf_ros.filter.measurements.antenna import lever_arm_of
 from eskf_ros.filter.output.status import quality_of, status_of
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, GYRO_BIAS, POSITION, SOURCES, VELOCITY
 from eskf_ros.geodesy.rotation import cross, from_matrix, from_rotation_vector, multiply, rotate, rotate_back, to_matrix
@@ -245,7 +246,7 @@ def add_unknown_heading(state, imu_offset, settings, row):
     The horizontal arm l from base_link to the antenna, not that to the IMU, points anywhere:
     E |R(a) l - R(b) l|^2 = 2 |l|^2 for a uniform angle a, |l|^2 for each axis.
     """
-    antenna = rotate(to_matrix(state.attitude), settings.lever_arms_body[0])
+    antenna = rotate(to_matrix(state.attitude), lever_arm_of(state, 0, settings))
     arm_squared = (antenna[0] + imu_offset[0]) ** 2 + (antenna[1] + imu_offset[1]) ** 2
     for i in range(2):
         row.pose_covariance[i, i] += arm_squared
