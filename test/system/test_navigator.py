@@ -98,13 +98,14 @@ def test_while_heading_is_unknown_position_is_fused_and_yaw_variance_is_a_half_t
 
 def test_a_long_lever_arm_of_unknown_heading_is_no_error_that_lasts():
     """Fixes change from one to the next as they claim, wherever the antenna is."""
-    resting = simulate("stand:60", seed=1, imu_rate=100.0, gnss_rate=5.0, lever_arm=(2.5, 0.0, 1.0))
+    resting = simulate("stand:60", seed=1, imu_rate=100.0, gnss_rate=5.0, lever_arm=(4.0, 0.0, 1.0))
     navigator, _ = run(resting)
     state = navigator.state[0]
     assert state["heading_known"] == 0
-    assert state["scatter"]["pairs"][0] > 200
+    np.testing.assert_allclose(state["scatter"]["claimed"][0], resting.fix_covariance[-1, ::4], rtol=1e-3)
+    # 289 pairs in three axes, the running mean of the last fifty: a standard deviation of 0.12.
+    assert state["scatter"]["change"][0] == pytest.approx(1.0, abs=0.36)
     assert state["scatter"]["calm"][0] == 0.0
-    assert not any("errors last" in note for note in navigator.notes)
 
 
 @pytest.mark.parametrize("heading_deg", [None, 35.0])
