@@ -131,7 +131,7 @@ from eskf_ros.ros_node import main, node
 class Stalled(node.EskfNode):
     def __init__(self, **options):
         super().__init__(**options)
-        self.create_subscription(Empty, "stall", lambda message: time.sleep(1.5), 1)
+        self.create_subscription(Empty, "stall", lambda message: time.sleep(3.0), 1)
 
 node.EskfNode = Stalled
 sys.exit(main.main())
@@ -139,13 +139,13 @@ sys.exit(main.main())
 
 
 def test_no_sample_is_lost_while_the_node_is_busy_elsewhere(ros, tmp_path: Path):
-    """750 samples come while a callback takes its time, on subscriptions as they are by default, which hold 1000."""
+    """600 samples come while a callback takes 3 s, on subscriptions as they are by default, which hold 1000."""
     from std_msgs.msg import Empty
 
     script = tmp_path / "stalled.py"
     script.write_text(STALLED)
-    rate = 500
-    recording = simulate("hour_drive", seed=3, imu_rate=float(rate), start=15.0, stop=22.0)
+    rate = 200
+    recording = simulate("hour_drive", seed=3, imu_rate=float(rate), start=15.0, stop=24.0)
     messages = hostile_traffic.drive(recording, time.time_ns())
     node = ros.spawn([script, "--ros-args", *PARAMETERS])
     robot = Robot(ros)
