@@ -14,6 +14,7 @@ the same.
 from __future__ import annotations
 
 import contextlib
+import copy
 import gc
 import hashlib
 import itertools
@@ -25,7 +26,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -136,12 +137,13 @@ def _folder_of(module: str, digest: str) -> Path:
         built = BUILT / folder.name
         if built.is_dir() and built != folder:
             # Under another name first: two processes may start at the same time.
-            copy = Path(tempfile.mkdtemp(dir=CACHE_FOLDER, prefix=".new_"))
-            shutil.copytree(built, copy, dirs_exist_ok=True)
+            CACHE_FOLDER.mkdir(parents=True, exist_ok=True)
+            new = Path(tempfile.mkdtemp(dir=CACHE_FOLDER, prefix=".new_"))
+            shutil.copytree(built, new, dirs_exist_ok=True)
             try:
-                copy.rename(folder)
+                new.rename(folder)
             except OSError:
-                shutil.rmtree(copy, ignore_errors=True)
+                shutil.rmtree(new, ignore_errors=True)
         folder.mkdir(parents=True, exist_ok=True)
     return folder
 
@@ -202,13 +204,35 @@ def sentence_on_compiling(say: Callable[[str], None]) -> Callable[[int], None]:
     return tell
 
 
+class _CopyWithOneScope:
+    """Takes the place of the module ``copy`` where numba puts one function into another (`njit_in_caller`).
+
+    numba 0.58, that of Ubuntu 24.04, copies the statements of such a function one by one, each with the table of all
+    variables: half of the first start. Here the statements of a block share one table, as in newer versions.
+    """
+
+    def __init__(self) -> None:
+        self._scope_of_block: dict[int, Any] = {}
+
+    def deepcopy(self, original: Any) -> Any:
+        from numba.core import ir
+
+        if not isinstance(original, ir.Block):
+            return copy.deepcopy(original, dict(self._scope_of_block))
+        copied = copy.deepcopy(original)
+        self._scope_of_block = {id(original.scope): copied.scope}
+        return copied
+
+
 @contextlib.contextmanager
 def _frugally() -> Iterator[None]:
     """Compile within this with less time and memory than numba by itself; other kernels of the process as they were."""
+    from numba.core import inline_closurecall
     from numba.core import types as numba_types
 
-    record: Any = numba_types.Record
+    inlining, record = cast(Any, inline_closurecall), cast(Any, numba_types.Record)
     level, thresholds, description = numba.config.OPT, gc.get_threshold(), record.__repr__
+    copying, inlining.copy = inlining.copy, _CopyWithOneScope()
     numba.config.OPT = type(level)(min(level, OPTIMISATION))
     gc.set_threshold(*COLLECTION)
     # numba describes the arguments to itself before each of its passes, which takes seconds for records in records.
@@ -216,6 +240,7 @@ def _frugally() -> Iterator[None]:
     try:
         yield
     finally:
+        inlining.copy = copying
         numba.config.OPT = level
         gc.set_threshold(*thresholds)
         record.__repr__ = description

@@ -197,7 +197,10 @@ class ReferenceFilter:
         self.x = transition[15:, 15:] @ self.x
 
     def force_of_errors(self, rotation: Array, force: Array, g: Array, dt: float) -> Array:
-        """Return the force in F: the horizontal part only where, and for a minute after, it stands out of its error."""
+        """Return the force in F: the horizontal part only where, and for a minute after, it stands out of its error.
+
+        When it begins to, what the low-passed acceleration of 1 s holds is made up for.
+        """
         vertical = force @ g / (g @ g) * g
         self.mean_acceleration = self.mean_acceleration + dt / 1.0 * (force - vertical - self.mean_acceleration)
         rows = np.hstack([-skew(vertical), -rotation])[:2]
@@ -205,7 +208,9 @@ class ReferenceFilter:
         variance = np.trace(rows @ covariance @ rows.T) / 2.0 + self.model.accel_density**2 / 2.0
         self.believed = max(0.0, self.believed - dt)
         if self.mean_acceleration @ self.mean_acceleration > 25.0 * variance:
+            missed = 1.0 / dt if self.believed == 0.0 else 0.0
             self.believed = 60.0
+            return force + missed * self.mean_acceleration
         return force if self.believed > 0.0 else vertical
 
     def transition(self, rotation: Array, force: Array, g: Array, dt: float) -> Array:

@@ -46,7 +46,7 @@ def active(seed: int, settings: Any = ALL) -> Any:
     """A state with all errors in use and its acceleration beyond doubt."""
     state = random_state(seed)
     update_error_size(state, int(settings["reach"].max()), settings)
-    state["heading_known"], state["excitation"]["acceleration"] = 1, (1e9, 0.0, 0.0)
+    state["heading_known"], state["excitation"]["left"] = 1, 60.0
     return state
 
 

@@ -52,7 +52,7 @@ def joined(seed: int) -> Any:
     state["covariance"][:SIZE, :SIZE] = random_covariance(seed, STDS)
     state["optional"][:3] = np.random.default_rng(seed).normal(size=3)
     # That it accelerates is beyond doubt: F has the whole force.
-    state["excitation"]["acceleration"] = (1e9, 0.0, 0.0)
+    state["excitation"]["left"] = 60.0
     return state
 
 

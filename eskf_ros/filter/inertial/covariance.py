@@ -54,6 +54,9 @@ def credible_force(excitation, covariance, rotation, force, gravity, dt, noise_d
     after the low-passed horizontal acceleration has exceeded `CREDIBLE` standard deviations from white noise
     (``noise_density``, m/s2/rtHz; Gelb, section 3.8) and from the covariance. Far from the datum these are about the
     horizontal of map, a few degrees off.
+
+    The motion had begun before it stood out: in the first step the change of velocity since then, about
+    `ACCELERATION_TIME` times the low-passed acceleration, is caught up with.
     """
     along = dot(force, gravity) / dot(gravity, gravity)
     vertical = (along * gravity[0], along * gravity[1], along * gravity[2])
@@ -66,7 +69,9 @@ def credible_force(excitation, covariance, rotation, force, gravity, dt, noise_d
     if square > CREDIBLE**2 * noise and square > CREDIBLE**2 * (
         noise + acceleration_variance(covariance, rotation, vertical)
     ):
+        missed = ACCELERATION_TIME / dt if excitation.left == 0.0 else 0.0
         excitation.left = EXCITED_TIME
+        return (force[0] + missed * mean[0], force[1] + missed * mean[1], force[2] + missed * mean[2])
     return force if excitation.left > 0.0 else vertical
 
 
