@@ -58,6 +58,8 @@ TRUST = np.dtype(
         ("refused_stamp", "i8", (2, SOURCES)),
         ("refused_innovation", "f8", (2, SOURCES, 3)),
         ("first_innovation", "f8", (2, SOURCES, 3)),
+        ("mean_innovation", "f8", (SOURCES, 3)),
+        ("mean_stamp", "i8", (SOURCES,)),
         ("change", "f8", (2, SOURCES, 3)),
         ("jumps", "i8", (2, SOURCES)),
         ("jump", "f8", (2, SOURCES)),
@@ -71,6 +73,8 @@ TRUST = np.dtype(
 - ``takeovers``: how often the humble lane took over.
 - ``refused``, ``refused_since``, ``refused_stamp``: messages refused in a row, the first and the last of them (ns).
 - ``refused_innovation``, ``first_innovation``: innovation of the last and of the first refused one (m or m/s, map).
+- ``mean_innovation``, ``mean_stamp``: mean of the innovations of refused fixes along the path as it is now (m, map),
+  and of their stamps (ns).
 - ``change``: largest change from one refused innovation to the next (m or m/s, map).
 - ``jumps``, ``jump``: how often a stream jumped, and the furthest (m or m/s).
 """

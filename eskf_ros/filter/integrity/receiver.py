@@ -42,6 +42,7 @@ from eskf_ros.filter.integrity.refusal import (
     kind_of,
     note_jump,
 )
+from eskf_ros.filter.integrity.refused_motion import update_with_refused_fix
 from eskf_ros.filter.integrity.scatter import (
     copy_scatter,
     learn_from_change,
@@ -177,6 +178,8 @@ def judge_with_humble_lane(states, aid, gate, settings, work):
     if humble.heading_known == 0:
         return False, jumps, believed, nis, log_determinant
     if jumps and is_position:
+        update_with_refused_fix(state, aid, settings, work)
+        linearize(humble, aid, settings, work)
         learn_from_change(state, humble, aid.source, False, settings, work)
         update_shares(state, humble, aid.source, settings, work)
     elif not jumps and not believed:
