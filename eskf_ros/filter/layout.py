@@ -21,6 +21,7 @@ from eskf_ros.filter.inertial.navigation_frame import FRAME
 from eskf_ros.filter.inertial.sample_quality import LEAST_FORCE_JUMP, LEAST_RATE_JUMP, SAMPLE_QUALITY
 from eskf_ros.filter.inertial.stamps import IMU_STAMPS
 from eskf_ros.filter.inertial.strapdown import IMU_READINGS
+from eskf_ros.filter.integrity.departure import DEPARTURE
 from eskf_ros.filter.integrity.fault_effects import FAULTS
 from eskf_ros.filter.integrity.heading_corrections import CORRECTIONS
 from eskf_ros.filter.integrity.heading_monitor import HEADING_MONITOR
@@ -110,6 +111,7 @@ STATE = np.dtype(
         ("receiver", RECEIVER_MONITOR),
         ("installation", INSTALLATION),
         ("motion", MOTION),
+        ("departure", DEPARTURE),
         ("mag", EARTH_FIELD),
         ("tight", TIGHT),
         ("streams", STREAMS),
@@ -271,6 +273,7 @@ _NEVER = {
     "scatter": ("last_stamp", "walk_stamp"),
     "installation": ("stamp", "checked"),
     "motion": ("fix_stamp", "heard_stamp", "velocity_stamp", "start_stamp", "last_stamp", "pause_stamp", "clock_stamp"),
+    "departure": ("since",),
     "mag": ("disturbed_stamp",),
     "heading": ("given_stamp", "tried_stamp", "contradicted_since"),
     "heading_monitor": ("given_stamp", "given_moved", "slip_stamp"),

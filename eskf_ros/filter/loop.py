@@ -11,6 +11,7 @@ from eskf_ros.filter.inertial.sample_doubt import copy_doubt
 from eskf_ros.filter.inertial.sample_quality import judge_sample
 from eskf_ros.filter.inertial.stamps import take_stamp
 from eskf_ros.filter.inertial.strapdown import SMOOTHING_TIME
+from eskf_ros.filter.integrity.departure import begin_departure, extend_departure
 from eskf_ros.filter.integrity.imu_monitor import watch_input, watch_interval
 from eskf_ros.filter.integrity.motion_monitor import add_sample
 from eskf_ros.filter.integrity.restart import reset_alignment
@@ -55,6 +56,7 @@ def advance(states, imu, aids, checkpoints, timeline, blank, settings_, work_, l
             take_sample(states[HUMBLE], sample, instant)
         watch_interval(state, settings)
         add_sample(state)
+        extend_departure(state)
         measure_step(state, settings)
         update_rest(state, settings)
         add_to_block(state, settings)
@@ -109,6 +111,8 @@ def update_rest(state, settings):
     if window != Window.OPEN:
         watch_input(state, window != Window.MOTION, settings)
         update_level(state, window, settings)
+        if window == Window.REST:
+            begin_departure(state)
         close_static_window(state)
 
 

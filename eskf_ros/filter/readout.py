@@ -12,6 +12,7 @@ from eskf_ros.filter.history.buffers import Buffers
 from eskf_ros.filter.history.clock_steps import ClockSteps, Step
 from eskf_ros.filter.history.records import RECORD
 from eskf_ros.filter.integrity.heading_monitor import is_heading_contradicted
+from eskf_ros.filter.integrity.motion_monitor import lag_of_receiver
 from eskf_ros.filter.integrity.motion_report import motion_complaints, travel_complaints
 from eskf_ros.filter.integrity.receiver_report import aid_complaints, aid_notes
 from eskf_ros.filter.integrity.recovery import phase_of
@@ -208,7 +209,7 @@ class Readout:
         # A wrong heading makes the fixes look faulty: warnings about the receivers would mislead.
         if not is_heading_contradicted(state):
             # Clocks that may be apart are told after some more turns, and would explain much.
-            is_explained = bool(clocks or inertial or axis_complaints(state)) or state["motion"]["turns"]["lag"] != 0.0
+            is_explained = bool(clocks or inertial or axis_complaints(state)) or lag_of_receiver(state) != 0.0
             found += aid_complaints(state, settings, is_explained, bool(samples or travel))
         return found + clocks
 

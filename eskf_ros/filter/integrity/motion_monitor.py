@@ -17,7 +17,18 @@ import numpy as np
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.history.records import XX, YY
-from eskf_ros.filter.integrity.motion_sums import MEMORY, PUSHES, SLOW, TURNS, add_push, add_turn
+from eskf_ros.filter.integrity.departure import hear_fix, hear_speed
+from eskf_ros.filter.integrity.motion_sums import (
+    FEWEST_TURNS,
+    MANY_TURNS,
+    MEMORY,
+    PUSHES,
+    SLOW,
+    TURNED,
+    TURNS,
+    add_push,
+    add_turn,
+)
 from eskf_ros.filter.integrity.refusal import rival_offset
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.time import NEVER, SECOND
@@ -171,6 +182,7 @@ def watch_motion(state, aid, settings):
 def watch_velocity(state, aid, settings):
     """Add a velocity to the way; compare it with the IMU a window after the one before."""
     motion = state.motion
+    hear_speed(state.departure, aid)
     extend_way(motion, aid.stamp)
     since = (aid.stamp - motion.heard_stamp) * 1e-9 if motion.heard_stamp != NEVER else math.inf
     if since <= WINDOW:
@@ -209,6 +221,8 @@ def watch_position(state, aid, settings):
     axes = east_north_up_to_ecef(aid.payload[0], aid.payload[1])
     if has_velocity:
         extend_way(motion, aid.stamp)
+    else:
+        hear_fix(state.departure, aid, fix, change_between(state.departure.rest_fix, fix, axes))
     if motion.fix_stamp != NEVER:
         # A fix may come within a pause of the IMU, of which no sample has told yet.
         motion.longest_interval = max(motion.longest_interval, (aid.stamp - state.imu.stamp) * 1e-9)
@@ -301,6 +315,18 @@ def offset_by_jumps(state):
         east -= state.trust.refused_innovation[0, 0, 0]
         north -= state.trust.refused_innovation[0, 0, 1]
     return (east, north) if math.hypot(east, north) > LEAST_JUMP else (0.0, 0.0)
+
+
+@njit
+def lag_of_receiver(state):
+    """Return by how much (s) the receiver is stamped later than the IMU; 0 where it is not notable, or not known.
+
+    Turns tell, once there are enough, and departures from rest before.
+    """
+    turns = state.motion.turns
+    fewest = FEWEST_TURNS if state.motion.heard_stamp != NEVER else MANY_TURNS
+    has_turned = turns.count >= fewest and turns.course_square * turns.count > TURNED * turns.weight
+    return turns.lag if has_turned or turns.lag != 0.0 else state.departure.lag
 
 
 @njit

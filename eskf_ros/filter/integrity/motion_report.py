@@ -8,15 +8,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from eskf_ros.filter.integrity.heading_monitor import slip_of
-from eskf_ros.filter.integrity.motion_sums import FEWEST_TURNS, SAME, TURNED
+from eskf_ros.filter.integrity.motion_monitor import lag_of_receiver
+from eskf_ros.filter.integrity.motion_sums import FEWEST_TURNS, MANY_TURNS, SAME, TURNED
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.time import NEVER, SECOND
 
 LONGEST_COMPARISON = 180 * SECOND
 """ns; after this time without turns or accelerations nothing is waited for."""
-
-MANY_TURNS = 30
-"""Windows of positions alone, whose courses scatter, from which on clocks may be said to be apart."""
 
 OTHER = 0.3
 """Correlation of changes of course with a gyro below which it does not show them."""
@@ -64,7 +62,16 @@ def motion_complaints(state: np.void) -> list[str]:
             "North-East-Down axes, and are not used; publish East-North-Up (REP-103)",
         ]
     fewest = 0 if motion["heard_stamp"] != NEVER else MANY_TURNS
+    if motion["turns"]["lag"] == 0.0 and (lag := float(lag_of_receiver(state))) != 0.0:
+        found.append(_clocks_apart("as the robot set out from rest", lag))
     return found + _turn_complaints(motion["turns"], fewest) + _push_complaints(motion["pushes"])
+
+
+def _clocks_apart(seen: str, lag: float) -> str:
+    return (
+        f"{seen} the receiver is stamped about {abs(lag):.1f} s {'later' if lag > 0.0 else 'earlier'} than "
+        "the IMU: the clocks are apart; synchronise the clocks, or set the time_offset of the receiver"
+    )
 
 
 def has_compared(state: np.void) -> bool:
@@ -88,10 +95,7 @@ def _turn_complaints(turns: np.void, fewest: int) -> list[str]:
     shown = products / np.sqrt(np.maximum(squares * square, 1e-18))
     lag = float(turns["lag"])
     if lag != 0.0 and turns["count"] >= fewest:
-        return [
-            f"by their turns the receiver is stamped about {abs(lag):.1f} s {'later' if lag > 0.0 else 'earlier'} than "
-            "the IMU: the clocks are apart; synchronise the clocks, or set the time_offset of the receiver"
-        ]
+        return [_clocks_apart("by their turns", lag)]
     if shown[2] < -SAME:
         return [
             "about the vertical of base_link the gyro turns the other way than the course: axes of the IMU are negated "

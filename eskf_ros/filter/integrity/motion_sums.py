@@ -79,6 +79,9 @@ LARGEST_TURN = 1.5
 FEWEST_TURNS = 15
 """Windows with a course from which on turns are compared."""
 
+MANY_TURNS = 30
+"""Such windows of positions alone, whose courses scatter, from which on they say whether clocks are apart."""
+
 TURNED = 0.4
 """rad2; sum of the squares of the changes of course from which on they are."""
 

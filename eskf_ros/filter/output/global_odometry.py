@@ -10,7 +10,7 @@ from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.levelling import UNKNOWN_SPEED
 from eskf_ros.filter.inertial.navigation_frame import body_rate, heading_of
 from eskf_ros.filter.integrity.fix_errors import held_variance
-from eskf_ros.filter.integrity.motion_monitor import offset_by_jumps
+from eskf_ros.filter.integrity.motion_monitor import lag_of_receiver, offset_by_jumps
 from eskf_ros.filter.measurements.antenna import lever_arm_of
 from eskf_ros.filter.output.status import quality_of, status_of
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, GYRO_BIAS, POSITION, SOURCES, VELOCITY
@@ -118,7 +118,7 @@ def write_odometry(state, local, settings, row):
     for i in range(2):
         for j in range(2):
             row.pose_covariance[i, j] += offset[i] * offset[j]
-    lag = state.motion.turns.lag
+    lag = lag_of_receiver(state)
     if lag != 0.0:
         for i in range(3):
             for j in range(3):

@@ -12,7 +12,7 @@ import math
 from eskf_ros.compiled import njit
 from eskf_ros.filter.integrity.fix_errors import held_variance
 from eskf_ros.filter.integrity.heading_monitor import has_lasting_difference
-from eskf_ros.filter.integrity.motion_monitor import offset_by_jumps
+from eskf_ros.filter.integrity.motion_monitor import lag_of_receiver, offset_by_jumps
 from eskf_ros.filter.state.enums import Quality, Status
 from eskf_ros.filter.state.error_state import ATTITUDE, ERROR_SIZE, POSITION, SOURCES
 from eskf_ros.filter.state.time import NEVER
@@ -87,7 +87,7 @@ def quality_of(state, status, settings):
     for i in range(2):
         variance += offset[i] ** 2
         variance += state.covariance[POSITION + i, POSITION + i] + held_variance(state, i)
-        variance += (state.motion.turns.lag * state.velocity_map[i]) ** 2
+        variance += (lag_of_receiver(state) * state.velocity_map[i]) ** 2
         for source in range(SOURCES):
             if state.installation.is_considered[source] == 1:
                 variance += state.installation.considered[source, POSITION + i] ** 2

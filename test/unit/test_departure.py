@@ -1,0 +1,103 @@
+"""Departures from rest: the lag between receiver and IMU, and what must not be taken for one."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from eskf_ros.filter.history.records import AID, XX, YY
+from eskf_ros.filter.inertial.covariance import ACCELERATION_TIME
+from eskf_ros.filter.integrity.departure import (
+    begin_departure,
+    extend_departure,
+    hear_fix,
+    hear_speed,
+)
+from eskf_ros.filter.state.time import NEVER, SECOND
+from support.kernels import make_state
+
+VELOCITY_STD, FIX_STD = 0.05, 1.0
+"""m/s and m per axis."""
+
+
+def depart(
+    lag: float = 0.0,
+    acceleration: float = 2.0,
+    has_velocity: bool = True,
+    error: float = 0.0,
+    seed: int = 0,
+    state: Any = None,
+) -> Any:
+    """Let a robot rest for 3.5 s, speed up to 12 m/s and go on for some seconds; return the state.
+
+    The receiver sends at 5 Hz, stamped ``lag`` (s) late. ``error``: of the acceleration by the IMU (m/s2), in its
+    direction. A ``state`` is continued.
+    """
+    state, rng = make_state() if state is None else state, np.random.default_rng(seed)
+    start = int(state["stamp"]) + SECOND
+    aid = np.zeros(1, AID)[0]
+    leaves, fast = 3.5, 3.5 + 12.0 / acceleration
+
+    def speed(t: float) -> float:
+        return acceleration * min(max(t - leaves, 0.0), 12.0 / acceleration)
+
+    def way(t: float) -> float:
+        moved = min(max(t - leaves, 0.0), 12.0 / acceleration)
+        return 0.5 * acceleration * moved * moved + 12.0 * max(t - fast, 0.0)
+
+    low_passed, dt = 0.0, 0.01
+    for k in range(1600):
+        t = k * dt
+        state["stamp"] = aid["stamp"] = start + k * 10_000_000
+        now = acceleration * (leaves <= t < fast) + error
+        low_passed += dt / ACCELERATION_TIME * (now - low_passed)
+        state["excitation"]["acceleration"] = (0.6 * low_passed, 0.8 * low_passed, 0.0)
+        if k in (0, 200):  # as each window of 2 s at rest ends
+            begin_departure(state)
+        extend_departure(state)
+        if k % 20:
+            continue
+        if has_velocity:
+            aid["payload"][[XX, YY]] = VELOCITY_STD**2
+            aid["payload"][:2] = rng.normal(0.0, VELOCITY_STD, 2) + (0.8 * speed(t - lag), -0.6 * speed(t - lag))
+            hear_speed(state["departure"], aid)
+        else:
+            aid["payload"][[XX, YY]] = FIX_STD**2
+            away = rng.normal(0.0, FIX_STD, 2) + (0.8 * way(t - lag), -0.6 * way(t - lag))
+            fix = np.array([away[0], away[1], 0.0])
+            away -= state["departure"]["rest_fix"][:2]
+            hear_fix(state["departure"], aid, fix, (away[0], away[1]))
+    return state
+
+
+@pytest.mark.parametrize("has_velocity", [True, False])
+@pytest.mark.parametrize("lag", [-1.5, 0.9, 1.2, 2.0])
+def test_a_lag_is_found(lag: float, has_velocity: bool) -> None:
+    state = depart(lag, has_velocity=has_velocity)
+    assert state["departure"]["lag"] == pytest.approx(lag, abs=0.2)
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("has_velocity", [True, False])
+@pytest.mark.parametrize(
+    ("acceleration", "error"), [(2.0, 0.0), (0.5, 0.0), (2.0, 0.2), (2.0, -0.2), (0.5, 0.15), (0.2, -0.1)]
+)
+def test_without_a_lag_none_is_found(acceleration: float, error: float, has_velocity: bool, seed: int) -> None:
+    """Nor where the level was found while the robot braked, so that its acceleration is wrong."""
+    assert depart(0.0, acceleration, has_velocity, error, seed)["departure"]["lag"] == 0.0
+
+
+def test_a_later_departure_without_a_lag_takes_it_back() -> None:
+    state = depart(1.2)
+    assert state["departure"]["lag"] != 0.0
+    assert depart(0.0, state=state)["departure"]["lag"] == 0.0
+
+
+def test_a_level_that_is_not_known_says_nothing() -> None:
+    state = make_state()
+    state["covariance"][6, 6] = state["covariance"][7, 7] = math.radians(3.0) ** 2
+    begin_departure(state)
+    assert state["departure"]["since"] == NEVER
