@@ -19,8 +19,8 @@ from eskf_ros.filter.integrity.departure import (
 from eskf_ros.filter.state.time import NEVER, SECOND
 from support.kernels import make_state
 
-VELOCITY_STD, FIX_STD = 0.05, 1.0
-"""m/s and m per axis."""
+VELOCITY_STD = 0.05
+"""m/s per axis."""
 
 
 def depart(
@@ -28,6 +28,7 @@ def depart(
     acceleration: float = 2.0,
     has_velocity: bool = True,
     error: float = 0.0,
+    fix_std: float = 1.0,
     seed: int = 0,
     state: Any = None,
 ) -> Any:
@@ -65,8 +66,8 @@ def depart(
             aid["payload"][:2] = rng.normal(0.0, VELOCITY_STD, 2) + (0.8 * speed(t - lag), -0.6 * speed(t - lag))
             hear_speed(state["departure"], aid)
         else:
-            aid["payload"][[XX, YY]] = FIX_STD**2
-            away = rng.normal(0.0, FIX_STD, 2) + (0.8 * way(t - lag), -0.6 * way(t - lag))
+            aid["payload"][[XX, YY]] = fix_std**2
+            away = rng.normal(0.0, fix_std, 2) + (0.8 * way(t - lag), -0.6 * way(t - lag))
             fix = np.array([away[0], away[1], 0.0])
             away -= state["departure"]["rest_fix"][:2]
             hear_fix(state["departure"], aid, fix, (away[0], away[1]))
@@ -76,8 +77,9 @@ def depart(
 @pytest.mark.parametrize("has_velocity", [True, False])
 @pytest.mark.parametrize("lag", [-1.5, 0.9, 1.2, 2.0])
 def test_a_lag_is_found(lag: float, has_velocity: bool) -> None:
-    state = depart(lag, has_velocity=has_velocity)
-    assert state["departure"]["lag"] == pytest.approx(lag, abs=0.2)
+    for fix_std in (1.0, 0.02):
+        state = depart(lag, has_velocity=has_velocity, fix_std=fix_std)
+        assert state["departure"]["lag"] == pytest.approx(lag, abs=0.2)
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -87,7 +89,8 @@ def test_a_lag_is_found(lag: float, has_velocity: bool) -> None:
 )
 def test_without_a_lag_none_is_found(acceleration: float, error: float, has_velocity: bool, seed: int) -> None:
     """Nor where the level was found while the robot braked, so that its acceleration is wrong."""
-    assert depart(0.0, acceleration, has_velocity, error, seed)["departure"]["lag"] == 0.0
+    for fix_std in (1.0, 0.02):
+        assert depart(0.0, acceleration, has_velocity, error, fix_std, seed)["departure"]["lag"] == 0.0
 
 
 def test_a_later_departure_without_a_lag_takes_it_back() -> None:

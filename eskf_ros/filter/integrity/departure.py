@@ -56,6 +56,9 @@ SHOWN = 64.0
 LEAST_SHIFT = (1.0, 5.0)
 """m/s, m; difference of speed and of way that a lag must make: slow motion, turns in place and waves look like one."""
 
+LEAST_STD = (0.1, 0.5)
+"""m/s, m; of the difference of the curves, however good the receiver is: lags are tried in steps, bodies lean."""
+
 FITS = 4.0
 """Mean square that it may leave."""
 
@@ -217,7 +220,8 @@ def left_with(departure, lag, last):
     column = 1 - departure.has_speed
     square, product, information, count = 0.0, 0.0, 1.0 / departure.variance, 0.0
     for j in range(departure.count):
-        passed, length, variance = departure.heard[j, 0], departure.heard[j, 1], departure.heard[j, 2]
+        passed, length = departure.heard[j, 0], departure.heard[j, 1]
+        variance = max(departure.heard[j, 2], LEAST_STD[column] ** 2)
         if passed > last:
             break
         difference = length - by_imu(departure, passed - lag, column)
