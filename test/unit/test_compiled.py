@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import pytest
@@ -32,7 +33,7 @@ def test_the_statements_of_a_block_share_one_table_of_variables() -> None:
     scope = ir.Scope(None, place)
     variables = [scope.define(name, place) for name in "abc"]
     block = ir.Block(scope, place)
-    for a, b in zip(variables, variables[1:]):
+    for a, b in itertools.pairwise(variables):
         block.append(ir.Assign(a, b, place))
     copier = compiled._CopyWithOneScope()
     copied = copier.deepcopy(block)
