@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from campaign.fault import DEFAULT_POSITION
+from campaign.running import recording_of, run_one
 from eskf_ros.filter.alignment.heading_search import begin_search, note_level, predict_search, turn_found, update_search
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import Status
 from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.scenario import Recording, simulate
+from faults import all_faults
 from support.kernels import make_settings, make_state, make_work
 
 DT = 0.01
@@ -178,6 +181,17 @@ def test_the_search_stays_honest_for_long(name: str, start: float, stop: float) 
         squares.append(off @ np.linalg.solve(p, off))
         assert np.sqrt(np.diag(p)).max() < 0.15
     assert sum(squares) < chi2.ppf(0.9999, 16), squares
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("name", ["clean: field_robot", "skid-steer"])
+def test_a_robot_with_positions_alone_is_never_certain_of_a_wrong_heading(name: str, seed: int) -> None:
+    """Defaults, and all that a beginner has: it brakes for two seconds as quietly as it then stands."""
+    fault = next(fault for fault in all_faults() if fault.name == name)
+    trace = run_one(fault, recording_of(fault, seed), DEFAULT_POSITION)
+    known = trace.is_known
+    assert (np.abs(trace.heading_error[known]) < 5.0 * trace.heading_sigma[known]).all()
+    assert (trace.error < 5.0 * trace.sigma).all()
 
 
 def heading_of(quaternion: np.ndarray) -> float:

@@ -24,10 +24,17 @@ LEVELLING = np.dtype(
     [
         ("kept_gyro_bias", "f8", (3,)),
         ("kept_gyro_variance", "f8"),
+        ("first_speed", "f8"),
+        ("unseen_braking", "f8"),
     ],
     align=True,
 )
-"""The gyro bias (rad/s) that was known before the run of still windows, and its variance."""
+"""What was known before the run of still windows.
+
+- ``kept_gyro_bias``, ``kept_gyro_variance``: the gyro bias (rad/s) and its variance.
+- ``first_speed``: how fast the robot may have been when the run began (m/s).
+- ``unseen_braking``: acceleration (m/s2) that would have used up this speed in the run.
+"""
 
 DRIFTED = 2.0
 """Ratio of the present tilt variance to that of a new level above which a robot in motion is levelled again."""
@@ -57,6 +64,7 @@ def level(state, sums, count, interval, is_rest, settings):
     is_first = count == state.window.samples
     if is_first:
         keep_gyro_bias(state)
+        state.levelling.first_speed = state.residual.first_speed
     accel_bias, accel_variance, gyro_bias, gyro_variance = known_biases(state, force, rate, duration, is_rest, settings)
     if is_rest and not can_be_rest(state, rate, gyro_bias, gyro_variance, duration, settings):
         # Readings that may not be at rest are treated as motion: they have to wait.
@@ -71,6 +79,7 @@ def level(state, sums, count, interval, is_rest, settings):
         return
     if is_rest:
         note_sway(state, is_first, settings)
+        state.levelling.unseen_braking = state.levelling.first_speed / duration
         change, variance = change_of_gravity(state, settings)
         force, rate = without_turn(force, rate, change, duration)
         # Readings that are those remembered from where the robot was left are not those of a robot that tilts.
@@ -138,11 +147,12 @@ def tilt_noise_at_rest(state, duration, strength, settings):
     """Return the variance (rad2) of the direction of the mean force, without that of the accelerometer bias.
 
     The bias is a random walk: its value at the end differs from its mean by a third of the variance that it gains
-    meanwhile.
+    meanwhile. A robot that may have moved when the run began may have braked evenly, which is as quiet as rest.
     """
     walked = settings.accel_bias_random_walk**2 * duration / 3.0
     swayed = sway_left(state.residual.force_variance, duration, settings)
-    return (settings.accel_noise_density**2 / duration + walked + swayed) / strength**2
+    braked = state.levelling.unseen_braking**2
+    return (settings.accel_noise_density**2 / duration + walked + swayed + braked) / strength**2
 
 
 @njit
@@ -189,9 +199,10 @@ def without_turn(force, rate, change, duration):
 
 @njit
 def is_level_better_known(state, variance):
-    """Say whether a swaying robot already has a level with a smaller variance (rad2) than the new one."""
+    """Say whether a robot that sways, or may have braked, already has a level with a smaller variance (rad2)."""
     known = max(state.covariance[ATTITUDE, ATTITUDE], state.covariance[ATTITUDE + 1, ATTITUDE + 1])
-    return state.residual.force_variance > 0.0 and state.level_known == 1 and known < variance
+    is_doubtful = state.residual.force_variance > 0.0 or state.levelling.unseen_braking > 0.0
+    return is_doubtful and state.level_known == 1 and known < variance
 
 
 @njit

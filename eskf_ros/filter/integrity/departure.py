@@ -32,7 +32,7 @@ HEARD_INTERVAL = 0.15
 """s; messages that follow sooner are left out."""
 
 LARGEST_LAG, LAG_STEP = 3.0, 0.1
-"""s; lags that are tried, to both sides, and the step between them."""
+"""s; lags that are tried, to both sides, and the step between them. The largest only shows that there is no less."""
 
 ACCELERATION_STD = 0.15
 """m/s2; standard deviation of a constant error of the acceleration, beside that of the covariance: the level may have
@@ -53,14 +53,17 @@ SET_OUT = 0.3
 SHOWN = 64.0
 """Sum of squares that a lag must explain: eight standard deviations."""
 
-LEAST_SHIFT = (1.0, 5.0)
-"""m/s, m; difference of speed and of way that a lag must make: slow motion, turns in place and waves look like one."""
+LEAST_SHIFT = (1.5, 5.0)
+"""m/s, m; difference of speed and of way that a lag must make: slow motion, walking, waves and turns look like one."""
 
 LEAST_STD = (0.1, 0.5)
 """m/s, m; of the difference of the curves, however good the receiver is: lags are tried in steps, bodies lean."""
 
 FITS = 4.0
-"""Mean square that it may leave."""
+"""Mean square that it may leave for each message in motion."""
+
+MOVED = 3.0
+"""Standard deviations that speed or way by the receiver must exceed for a message to be one in motion."""
 
 DEPARTURE = np.dtype(
     [
@@ -207,13 +210,16 @@ def update_lag(departure):
             if none - left > most:
                 lag, most, left_most, count_most = side * k * LAG_STEP, none - left, left, count
                 shift = by_imu(departure, last, column) - by_imu(departure, last - abs(lag), column)
-    if most > SHOWN and left_most < FITS * count_most and shift > LEAST_SHIFT[column]:
+    is_within = abs(lag) < LARGEST_LAG - 0.5 * LAG_STEP
+    if is_within and most > SHOWN and left_most < FITS * count_most and shift > LEAST_SHIFT[column]:
         departure.lag = lag if abs(lag) > NOTABLE_LAG else 0.0
 
 
 @njit
 def left_with(departure, lag, last):
-    """Return the sum of squares that a lag (s) leaves of the messages up to the time ``last`` (s), and their number.
+    """Return the sum of squares that a lag (s) leaves of the messages up to the time ``last`` (s).
+
+    And how many of them are in motion.
 
     What a constant error of the acceleration explains, as likely as it is, is taken out (it is marginalised).
     """
@@ -229,7 +235,7 @@ def left_with(departure, lag, last):
         square += difference * difference / variance
         product += difference * effect / variance
         information += effect * effect / variance
-        count += 1.0
+        count += 1.0 if length * length > MOVED**2 * variance else 0.0
     return square - product * product / information, count
 
 

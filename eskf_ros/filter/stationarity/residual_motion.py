@@ -20,6 +20,7 @@ from eskf_ros.geodesy.rotation import dot
 RESIDUAL_MOTION = np.dtype(
     [
         ("moved_first", "i8"),
+        ("first_speed", "f8"),
         ("part_start", "i8"),
         ("part_count", "i8"),
         ("part_sum", "f8", (6,)),
@@ -33,7 +34,7 @@ RESIDUAL_MOTION = np.dtype(
 )
 """The parts of the static window, and the residual motion that they show.
 
-- ``moved_first``: whether the robot moved when the window began.
+- ``moved_first``, ``first_speed``: whether the robot moved when the window began, and how fast it may have (m/s).
 - ``part_start``, ``part_count``, ``part_sum``: start (ns), samples and sums (m/s2, rad/s) of the part being filled.
 - ``parts``, ``part_mean_sum``, ``part_square_sum``: number of full parts, sums of their means and of the squares.
 - ``force_variance``, ``rate_variance``: largest variance of the means in the present run of still windows ((m/s2)2,
@@ -68,6 +69,7 @@ def add_to_part(state):
     """Add the newest IMU sample to the present part of the static window; a new window begins with new parts."""
     if state.window.start == NEVER:
         state.residual.moved_first = 1 if is_moving(state) else 0
+        state.residual.first_speed = possible_speed(state)
         state.residual.part_start = state.stamp
         state.residual.part_count = 0
         state.residual.parts = 0
@@ -97,10 +99,25 @@ def is_moving(state):
     if state.position_known == 0:
         return False
     v = state.velocity_map
+    return math.sqrt(dot(v, v)) - REST_SIGMAS * math.sqrt(velocity_variance(state)) > MOVING_SPEED
+
+
+@njit
+def possible_speed(state):
+    """Return how fast the robot may be (m/s; root mean square); 0 before the first position: it starts at rest."""
+    if state.position_known == 0:
+        return 0.0
+    v = state.velocity_map
+    return math.sqrt(dot(v, v) + velocity_variance(state))
+
+
+@njit
+def velocity_variance(state):
+    """Return the variance of the velocity (m2/s2) of the axis that is known worst."""
     variance = 0.0
     for i in range(3):
         variance = max(variance, state.covariance[VELOCITY + i, VELOCITY + i])
-    return math.sqrt(dot(v, v)) - REST_SIGMAS * math.sqrt(variance) > MOVING_SPEED
+    return variance
 
 
 @njit

@@ -63,6 +63,10 @@ VELOCITY_SIGMAS = 3.0
 REST_TOLERANCE = 0.2
 """m/s2; change of the horizontal mean specific force that a robot at rest may show while its springs settle."""
 
+BRAKING_SIGMAS = 3.0
+"""Ratio of the change of the mean specific force to an acceleration that the last level may hold unseen, up to which
+the robot has only ceased to brake."""
+
 REST_RATE_SIGMAS = 4.0
 """Standard deviations by which the mean rate at rest may differ from the estimated gyro bias plus Earth rate."""
 
@@ -238,4 +242,5 @@ def is_same_rest(state, settings):
     for i in range(3):
         bias_variance = max(bias_variance, state.covariance[GYRO_BIAS + i, GYRO_BIAS + i])
     drift = 3.0 * math.sqrt(bias_variance) * (state.stamp - state.window.still_stamp) * 1e-9
-    return math.sqrt(dot(sideways, sideways)) < REST_TOLERANCE + STANDARD_GRAVITY * drift
+    tolerance = REST_TOLERANCE + STANDARD_GRAVITY * drift + BRAKING_SIGMAS * state.levelling.unseen_braking
+    return math.sqrt(dot(sideways, sideways)) < tolerance
