@@ -11,7 +11,14 @@ from scipy.stats import chi2
 
 from campaign.fault import DEFAULT_POSITION
 from campaign.running import recording_of, run_one
-from eskf_ros.filter.alignment.heading_search import begin_search, note_level, predict_search, turn_found, update_search
+from eskf_ros.filter.alignment.heading_search import (
+    begin_search,
+    hide_motion,
+    note_level,
+    predict_search,
+    turn_found,
+    update_search,
+)
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import Status
 from eskf_ros.parameters.mapping import from_mapping
@@ -181,6 +188,26 @@ def test_the_search_stays_honest_for_long(name: str, start: float, stop: float) 
         squares.append(off @ np.linalg.solve(p, off))
         assert np.sqrt(np.diag(p)).max() < 0.15
     assert sum(squares) < chi2.ppf(0.9999, 16), squares
+
+
+@pytest.mark.parametrize("turn_std", [0.05, 0.5, 3.0])
+def test_a_hole_in_the_imu_hides_a_turn_from_the_search(turn_std: float) -> None:
+    """Mean and covariance of (cos, sin) and velocity are those of as many searches, turned by chance."""
+    search = Search(3, 1.0)
+    search.drive((0.8, 0.3), 4.0)
+    search.drive((-0.2, 0.5), 2.0)
+    x, p = search.state["search"]["estimate"].copy(), search.state["search"]["covariance"].copy()
+    random = np.random.default_rng(0)
+    samples = random.multivariate_normal(x, p, 200_000)
+    angles = random.normal(0.0, turn_std, len(samples))
+    turned_by = np.exp(1j * angles) * (samples[:, 4] + 1j * samples[:, 5])
+    samples[:, 4], samples[:, 5] = turned_by.real, turned_by.imag
+    samples[:, 2:4] += random.normal(0.0, 0.5, (len(samples), 2))
+    hide_motion(search.state, 0.5**2, turn_std**2)
+    found = search.state["search"]
+    np.testing.assert_allclose(found["estimate"][:6], samples[:, :6].mean(axis=0), atol=0.01)
+    np.testing.assert_allclose(found["covariance"][2:6, 2:6], np.cov(samples[:, 2:6].T), atol=0.01)
+    assert np.linalg.eigvalsh(found["covariance"]).min() > 0.0
 
 
 @pytest.mark.parametrize("seed", range(3))

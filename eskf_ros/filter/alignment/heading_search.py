@@ -191,6 +191,35 @@ def predict_search(state, acceleration, rotation, dt, settings):
 
 
 @njit
+def hide_motion(state, velocity_variance, turn_variance):
+    """Widen the search by motion that was not measured: a change of velocity (m2/s2 per axis) and a turn (rad2).
+
+    A turn by an angle d, normal with variance q, leaves exp(-q/2) of the mean of x = (cos, sin), and exp(-2 q) of the
+    part of E[x x'] that has a direction (moments of a wrapped normal; Mardia and Jupp, Directional Statistics, section
+    3.5.7).
+    """
+    if state.search.started == 0:
+        return
+    x, p, c = state.search.estimate, state.search.covariance, COSINE
+    left, left_twice = math.exp(-0.5 * turn_variance), math.exp(-2.0 * turn_variance)
+    mean = 0.5 * (p[c, c] + p[c + 1, c + 1] + x[c] ** 2 + x[c + 1] ** 2)
+    cosine = mean + left_twice * (p[c, c] + x[c] ** 2 - mean)
+    sine = mean + left_twice * (p[c + 1, c + 1] + x[c + 1] ** 2 - mean)
+    mixed = left_twice * (p[c, c + 1] + x[c] * x[c + 1])
+    for i in range(c, c + 2):
+        x[i] *= left
+        for j in range(SEARCH_SIZE):
+            p[i, j] *= left
+            p[j, i] *= left
+    p[c, c] = cosine - x[c] ** 2
+    p[c + 1, c + 1] = sine - x[c + 1] ** 2
+    p[c, c + 1] = p[c + 1, c] = mixed - x[c] * x[c + 1]
+    for i in range(2):
+        p[2 + i, 2 + i] += velocity_variance
+        p[TILT + i, TILT + i] += STANDARD_GRAVITY**2 * turn_variance
+
+
+@njit
 def update_search(state, first, measured, lever, noise, gate, work):
     """Update the search with east and north of a position (``first`` 0, m) or velocity (2, m/s) of the antenna.
 
