@@ -6,9 +6,11 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import eskf_ros
+from eskf_ros.filter.layout import STATE
 
 PACKAGE = Path(eskf_ros.__file__).parent
 FILTER = PACKAGE / "filter"
@@ -242,3 +244,13 @@ def test_long_files_and_functions_give_their_reason(source: Path) -> None:
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef) and (node.end_lineno or 0) - node.lineno + 1 > 60:
             assert "Over 60 lines: " in (ast.get_docstring(node) or ""), node.name
+
+
+def test_no_field_of_the_state_has_the_name_of_an_attribute_of_records() -> None:
+    """Uncompiled, ``state.room.sum`` would be a method of numpy."""
+
+    def names(kind: np.dtype) -> set[str]:
+        kind = kind.base
+        return set().union(*({name} | names(kind[name]) for name in kind.names or ()))
+
+    assert not names(STATE) & set(dir(np.record))

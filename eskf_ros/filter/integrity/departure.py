@@ -68,7 +68,7 @@ MOVED = 3.0
 DEPARTURE = np.dtype(
     [
         ("since", "i8"),
-        ("sum", "f8", (2,)),
+        ("integral", "f8", (2,)),
         ("acceleration", "f8", (2,)),
         ("velocity", "f8", (2,)),
         ("way", "f8", (2,)),
@@ -87,8 +87,8 @@ DEPARTURE = np.dtype(
 """The last departure from rest, by the IMU and by the first receiver.
 
 - ``since``: the rest from which on it is watched (ns).
-- ``acceleration``, ``sum``: by the IMU, low-passed (m/s2), and its integral (m/s), along x and y of map, however it is
-  turned while the heading is unknown; ``velocity``, ``way``: what follows from them (m/s, m).
+- ``acceleration``, ``integral``: by the IMU, low-passed (m/s2), and its integral (m/s), along x and y of map, however
+  it is turned while the heading is unknown; ``velocity``, ``way``: what follows from them (m/s, m).
 - ``variance``: of a constant error of the acceleration (m2/s4).
 - ``bins``, ``by_imu``: how many intervals (`BIN`) have passed, speed and way at their ends.
 - ``count``, ``heard``: messages of the receiver: time since the rest (s), speed or way (m/s or m) and its variance.
@@ -113,7 +113,7 @@ def begin_departure(state):
     for i in range(2):
         departure.velocity[i] = departure.way[i] = 0.0
         departure.acceleration[i] = state.excitation.acceleration[i]
-        departure.sum[i] = -ACCELERATION_TIME * departure.acceleration[i]
+        departure.integral[i] = -ACCELERATION_TIME * departure.acceleration[i]
 
 
 @njit
@@ -136,9 +136,9 @@ def extend_departure(state):
         return
     for i in range(2):
         now, velocity = state.excitation.acceleration[i], departure.velocity[i]
-        departure.sum[i] += 0.5 * BIN * (departure.acceleration[i] + now)
+        departure.integral[i] += 0.5 * BIN * (departure.acceleration[i] + now)
         departure.acceleration[i] = now
-        departure.velocity[i] = departure.sum[i] + ACCELERATION_TIME * now
+        departure.velocity[i] = departure.integral[i] + ACCELERATION_TIME * now
         departure.way[i] += 0.5 * BIN * (velocity + departure.velocity[i])
     departure.by_imu[departure.bins, 0] = math.hypot(departure.velocity[0], departure.velocity[1])
     departure.by_imu[departure.bins, 1] = math.hypot(departure.way[0], departure.way[1])
