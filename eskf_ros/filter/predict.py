@@ -15,7 +15,7 @@ from eskf_ros.filter.inertial.strapdown import propagate_nominal_state
 from eskf_ros.filter.output.forward_log import carry_transition
 from eskf_ros.filter.state import augmented_states
 from eskf_ros.filter.state.error_state import ERROR_SIZE
-from eskf_ros.filter.state.time import NEVER, SECOND
+from eskf_ros.filter.state.time import SECOND
 from eskf_ros.geodesy.rotation import dot
 
 LONGEST_STEP = 20_000_000
@@ -58,7 +58,6 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
         predict_search(state, acceleration, middle, dt, settings)
         if gap > 0.0:
             hide_motion(state, settings.gap_accel_std**2 * gap * dt, settings.gap_gyro_std**2 * gap * dt)
-            state.spot.stamp = NEVER
         velocity_noise += WANDER_TIME * (WANDER_ACCELERATION**2 + dot(acceleration, acceleration))
     size, covariance = state.error_size, state.covariance
     shaken = min(shaken_density(state.quality, 0, state.imu.interval), LARGEST_SHAKEN_DENSITY)

@@ -194,10 +194,13 @@ def predict_search(state, acceleration, rotation, dt, settings):
 def hide_motion(state, velocity_variance, turn_variance):
     """Widen the search by motion that was not measured: a change of velocity (m2/s2 per axis) and a turn (rad2).
 
+    The watch for a turn in place stops.
+
     A turn by an angle d, normal with variance q, leaves exp(-q/2) of the mean of x = (cos, sin), and exp(-2 q) of the
     part of E[x x'] that has a direction (moments of a wrapped normal; Mardia and Jupp, Directional Statistics, section
     3.5.7).
     """
+    state.spot.stamp = NEVER
     if state.search.started == 0:
         return
     x, p, c = state.search.estimate, state.search.covariance, COSINE

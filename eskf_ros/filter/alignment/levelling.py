@@ -24,16 +24,14 @@ LEVELLING = np.dtype(
     [
         ("kept_gyro_bias", "f8", (3,)),
         ("kept_gyro_variance", "f8"),
-        ("first_speed", "f8"),
         ("unseen_braking", "f8"),
     ],
     align=True,
 )
-"""What was known before the run of still windows.
+"""What levelling knows.
 
-- ``kept_gyro_bias``, ``kept_gyro_variance``: the gyro bias (rad/s) and its variance.
-- ``first_speed``: how fast the robot may have been when the run began (m/s).
-- ``unseen_braking``: acceleration (m/s2) that would have used up this speed in the run.
+- ``kept_gyro_bias``, ``kept_gyro_variance``: the gyro bias (rad/s) before the run of still windows, and its variance.
+- ``unseen_braking``: acceleration (m/s2; root mean square) that the last level at rest may have taken for a tilt.
 """
 
 DRIFTED = 2.0
@@ -64,7 +62,6 @@ def level(state, sums, count, interval, is_rest, settings):
     is_first = count == state.window.samples
     if is_first:
         keep_gyro_bias(state)
-        state.levelling.first_speed = state.residual.first_speed
     accel_bias, accel_variance, gyro_bias, gyro_variance = known_biases(state, force, rate, duration, is_rest, settings)
     if is_rest and not can_be_rest(state, rate, gyro_bias, gyro_variance, duration, settings):
         # Readings that may not be at rest are treated as motion: they have to wait.
@@ -79,17 +76,18 @@ def level(state, sums, count, interval, is_rest, settings):
         return
     if is_rest:
         note_sway(state, is_first, settings)
-        state.levelling.unseen_braking = state.levelling.first_speed / duration
+        braking = state.window.still_speed / duration
         change, variance = change_of_gravity(state, settings)
         force, rate = without_turn(force, rate, change, duration)
         # Readings that are those remembered from where the robot was left are not those of a robot that tilts.
         is_remembered = accel_variance < settings.accel_bias_std**2
         turn_variance = 0.0 if is_remembered else variance / strength**2
-        tilt_noise = tilt_noise_at_rest(state, duration, strength, settings)
+        tilt_noise = tilt_noise_at_rest(state, duration, strength, braking, settings)
         if dot(change, change) > 0.0:
             tilt_noise += (0.5 * duration) ** 2 * turn_variance
-        if is_level_better_known(state, accel_variance / strength**2 + tilt_noise):
+        if is_level_better_known(state, accel_variance / strength**2 + tilt_noise, braking):
             return
+        state.levelling.unseen_braking = braking
     else:
         tilt_noise = settings.moving_tilt_std**2 + dot(rate, rate) * (assumed_speed(state) / strength) ** 2
     heading = heading_of(state, settings)
@@ -143,16 +141,16 @@ def sway_left(sway, duration, settings):
 
 
 @njit
-def tilt_noise_at_rest(state, duration, strength, settings):
+def tilt_noise_at_rest(state, duration, strength, braking, settings):
     """Return the variance (rad2) of the direction of the mean force, without that of the accelerometer bias.
 
     The bias is a random walk: its value at the end differs from its mean by a third of the variance that it gains
-    meanwhile. A robot that may have moved when the run began may have braked evenly, which is as quiet as rest.
+    meanwhile. ``braking`` (m/s2): the acceleration that would have used up, in the run, the speed that the robot may
+    have had when it began; to brake evenly is as quiet as rest.
     """
     walked = settings.accel_bias_random_walk**2 * duration / 3.0
     swayed = sway_left(state.residual.force_variance, duration, settings)
-    braked = state.levelling.unseen_braking**2
-    return (settings.accel_noise_density**2 / duration + walked + swayed + braked) / strength**2
+    return (settings.accel_noise_density**2 / duration + walked + swayed + braking**2) / strength**2
 
 
 @njit
@@ -198,10 +196,10 @@ def without_turn(force, rate, change, duration):
 
 
 @njit
-def is_level_better_known(state, variance):
+def is_level_better_known(state, variance, braking):
     """Say whether a robot that sways, or may have braked, already has a level with a smaller variance (rad2)."""
     known = max(state.covariance[ATTITUDE, ATTITUDE], state.covariance[ATTITUDE + 1, ATTITUDE + 1])
-    is_doubtful = state.residual.force_variance > 0.0 or state.levelling.unseen_braking > 0.0
+    is_doubtful = state.residual.force_variance > 0.0 or braking > 0.0
     return is_doubtful and state.level_known == 1 and known < variance
 
 

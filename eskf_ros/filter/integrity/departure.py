@@ -31,8 +31,11 @@ HEARD = 60
 HEARD_INTERVAL = 0.15
 """s; messages that follow sooner are left out."""
 
-LARGEST_LAG, LAG_STEP = 3.0, 0.1
-"""s; lags that are tried, to both sides, and the step between them. The largest only shows that there is no less."""
+LARGEST_LAG = 3.0
+"""s; lags up to here are tried, to both sides. One that fits best at this end is not known."""
+
+LAG_STEP = 0.1
+"""s; step between the lags that are tried."""
 
 ACCELERATION_STD = 0.15
 """m/s2; standard deviation of a constant error of the acceleration, beside that of the covariance: the level may have
@@ -209,7 +212,8 @@ def update_lag(departure):
             left, _ = left_with(departure, side * k * LAG_STEP, last)
             if none - left > most:
                 lag, most, left_most, count_most = side * k * LAG_STEP, none - left, left, count
-                shift = by_imu(departure, last, column) - by_imu(departure, last - abs(lag), column)
+                shift = length_by_imu(departure, last, column)
+                shift -= length_by_imu(departure, last - abs(lag), column)
     is_within = abs(lag) < LARGEST_LAG - 0.5 * LAG_STEP
     if is_within and most > SHOWN and left_most < FITS * count_most and shift > LEAST_SHIFT[column]:
         departure.lag = lag if abs(lag) > NOTABLE_LAG else 0.0
@@ -217,9 +221,7 @@ def update_lag(departure):
 
 @njit
 def left_with(departure, lag, last):
-    """Return the sum of squares that a lag (s) leaves of the messages up to the time ``last`` (s).
-
-    And how many of them are in motion.
+    """Return the sum of squares that a lag (s) leaves of messages up to ``last`` (s), and how many are in motion.
 
     What a constant error of the acceleration explains, as likely as it is, is taken out (it is marginalised).
     """
@@ -230,7 +232,7 @@ def left_with(departure, lag, last):
         variance = max(departure.heard[j, 2], LEAST_STD[column] ** 2)
         if passed > last:
             break
-        difference = length - by_imu(departure, passed - lag, column)
+        difference = length - length_by_imu(departure, passed - lag, column)
         effect = passed if column == 0 else 0.5 * passed * passed
         square += difference * difference / variance
         product += difference * effect / variance
@@ -240,7 +242,7 @@ def left_with(departure, lag, last):
 
 
 @njit
-def by_imu(departure, passed, column):
+def length_by_imu(departure, passed, column):
     """Return speed or way (``column`` 0 or 1) by the IMU at a time (s) since the rest, linear between those kept."""
     place = passed / BIN - 1.0
     if place <= -1.0 or departure.bins == 0:

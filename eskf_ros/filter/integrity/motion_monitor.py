@@ -24,10 +24,10 @@ from eskf_ros.filter.integrity.motion_sums import (
     MEMORY,
     PUSHES,
     SLOW,
-    TURNED,
     TURNS,
     add_push,
     add_turn,
+    has_turned,
 )
 from eskf_ros.filter.integrity.refusal import rival_offset
 from eskf_ros.filter.state.enums import Stream
@@ -325,8 +325,7 @@ def lag_of_receiver(state):
     """
     turns = state.motion.turns
     fewest = FEWEST_TURNS if state.motion.heard_stamp != NEVER else MANY_TURNS
-    has_turned = turns.count >= fewest and turns.course_square * turns.count > TURNED * turns.weight
-    return turns.lag if has_turned or turns.lag != 0.0 else state.departure.lag
+    return turns.lag if has_turned(turns, fewest) or turns.lag != 0.0 else state.departure.lag
 
 
 @njit

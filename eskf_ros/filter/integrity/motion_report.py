@@ -9,7 +9,7 @@ import numpy as np
 
 from eskf_ros.filter.integrity.heading_monitor import slip_of
 from eskf_ros.filter.integrity.motion_monitor import lag_of_receiver
-from eskf_ros.filter.integrity.motion_sums import FEWEST_TURNS, MANY_TURNS, SAME, TURNED
+from eskf_ros.filter.integrity.motion_sums import FEWEST_TURNS, MANY_TURNS, SAME, TURNED, has_turned
 from eskf_ros.filter.state.enums import Stream
 from eskf_ros.filter.state.time import NEVER, SECOND
 
@@ -77,9 +77,8 @@ def _clocks_apart(seen: str, lag: float) -> str:
 def has_compared(state: np.void) -> bool:
     """Say whether the axes of the IMU have been compared with the motion, or would have been by now."""
     turns = state["motion"]["turns"]
-    has_turned = turns["count"] >= FEWEST_TURNS and turns["course_square"] * turns["count"] > TURNED * turns["weight"]
-    has_pushed = state["motion"]["pushes"]["count"] >= FEWEST_PUSHES
-    return bool(has_turned and has_pushed) or int(state["stamp"]) - int(state["first_stamp"]) > LONGEST_COMPARISON
+    has_both = has_turned(turns, FEWEST_TURNS) and state["motion"]["pushes"]["count"] >= FEWEST_PUSHES
+    return bool(has_both) or int(state["stamp"]) - int(state["first_stamp"]) > LONGEST_COMPARISON
 
 
 def _turn_complaints(turns: np.void, fewest: int) -> list[str]:

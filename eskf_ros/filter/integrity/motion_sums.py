@@ -140,6 +140,12 @@ def add_turn(turns, before, after, turn, variance, start, passed):
 
 
 @njit
+def has_turned(turns, fewest):
+    """Say whether there were turns, in at least ``fewest`` windows, for course and gyro to be compared."""
+    return turns.count >= fewest and turns.course_square * turns.count > TURNED * turns.weight
+
+
+@njit
 def add_shifted(sums, weight, course, turns_about_z):
     """Add the differences of a course (rad) from three integrated rates to ``sums`` (4, 4): see `TURNS`."""
     differences = (course - turns_about_z[0], course - turns_about_z[1], course - turns_about_z[2], 1.0)

@@ -83,11 +83,11 @@ def quality_of(state, status, settings):
     if status == Status.COASTING and state.stamp - state.recovery.absolute_stamp > coast_time:
         return Quality.COASTED_TOO_LONG
     variance = 0.0
-    offset = offset_by_jumps(state)
+    offset, lag = offset_by_jumps(state), lag_of_receiver(state)
     for i in range(2):
         variance += offset[i] ** 2
         variance += state.covariance[POSITION + i, POSITION + i] + held_variance(state, i)
-        variance += (lag_of_receiver(state) * state.velocity_map[i]) ** 2
+        variance += (lag * state.velocity_map[i]) ** 2
         for source in range(SOURCES):
             if state.installation.is_considered[source] == 1:
                 variance += state.installation.considered[source, POSITION + i] ** 2

@@ -30,6 +30,7 @@ STATIC_WINDOW = np.dtype(
         ("still_total", "f8", (6,)),
         ("still_start", "i8"),
         ("still_force", "f8", (3,)),
+        ("still_speed", "f8"),
         ("motion_stamp", "i8"),
         ("last_fix_stamp", "i8", (SOURCES,)),
         ("last_fix_ecef", "f8", (SOURCES, 3)),
@@ -46,7 +47,7 @@ sensors.
   ``half_samples``, ``half_force``: samples in its first half, and their force (m/s2).
 - ``still_stamp``, ``still_samples``, ``still_total``: the end of the last still window (ns), samples and sums of the
   run. ``still_start``, ``still_force``: the start of its first window (ns), and the mean force (m/s2) in the first half
-  of that.
+  of that. ``still_speed``: how fast the robot may have been then (m/s).
 - ``motion_stamp``: when another sensor last proved motion (ns).
 - ``last_fix_*``: the last fix by receiver, because their antennas are apart: stamp (ns), ECEF (m), variance (m2).
 - ``anchor_*``: the fix by receiver from which the window started.
@@ -141,6 +142,7 @@ def update_static_window(state, settings):
             for i in range(6):
                 state.window.still_total[i] = 0.0
             state.window.still_start = state.window.start
+            state.window.still_speed = state.residual.first_speed
             for i in range(3):
                 state.window.still_force[i] = state.window.half_force[i] / state.window.half_samples
         state.window.still_samples += state.window.samples
