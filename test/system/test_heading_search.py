@@ -20,7 +20,9 @@ from eskf_ros.filter.alignment.heading_search import (
     update_search,
 )
 from eskf_ros.filter.navigator import Navigator
+from eskf_ros.filter.predict import step
 from eskf_ros.filter.state.enums import Status
+from eskf_ros.filter.state.time import NEVER
 from eskf_ros.parameters.mapping import from_mapping
 from eskf_ros.simulate.scenario import Recording, simulate
 from faults import all_faults
@@ -208,6 +210,23 @@ def test_a_hole_in_the_imu_hides_a_turn_from_the_search(turn_std: float) -> None
     np.testing.assert_allclose(found["estimate"][:6], samples[:, :6].mean(axis=0), atol=0.01)
     np.testing.assert_allclose(found["covariance"][2:6, 2:6], np.cov(samples[:, 2:6].T), atol=0.01)
     assert np.linalg.eigvalsh(found["covariance"]).min() > 0.0
+
+
+def test_only_what_a_hole_hides_widens_the_search() -> None:
+    search = Search(3, 1.0)
+    search.drive((0.8, 0.3), 4.0)
+    before = search.state["search"]["covariance"][4:6, 4:6].trace()
+    search.state["spot"]["stamp"] = 1
+    level, still = (0.0, 0.0, 9.81), (0.0, 0.0, 0.0)
+    step(search.state, level, still, level, still, 0.02, 0.0, search.settings, search.work)
+    assert search.state["search"]["covariance"][4:6, 4:6].trace() == pytest.approx(before, rel=0.01)
+    assert search.state["spot"]["stamp"] == 1
+    step(search.state, level, still, level, still, 0.02, 1.6, search.settings, search.work)
+    length = np.hypot(*search.state["search"]["estimate"][4:6])
+    hidden = (length * float(search.settings["gap_gyro_std"])) ** 2 * 1.6 * 0.02
+    found = search.state["search"]["covariance"][4:6, 4:6].trace()
+    assert found == pytest.approx(before + hidden, rel=0.05)
+    assert search.state["spot"]["stamp"] == NEVER
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -16,6 +16,9 @@ from eskf_ros.filter.integrity.departure import (
     hear_fix,
     hear_speed,
 )
+from eskf_ros.filter.integrity.motion_monitor import lag_of_receiver
+from eskf_ros.filter.integrity.motion_report import motion_complaints
+from eskf_ros.filter.integrity.motion_sums import FEWEST_TURNS
 from eskf_ros.filter.state.time import NEVER, SECOND
 from support.kernels import make_state
 
@@ -104,3 +107,39 @@ def test_a_level_that_is_not_known_says_nothing() -> None:
     state["covariance"][6, 6] = state["covariance"][7, 7] = math.radians(3.0) ** 2
     begin_departure(state)
     assert state["departure"]["since"] == NEVER
+
+
+def test_a_heading_that_was_given_may_be_corrected_below_the_motion() -> None:
+    state = make_state()
+    begin_departure(state)
+    assert state["departure"]["since"] == state["stamp"]
+    state["heading_known"], state["heading"]["given_stamp"] = 1, SECOND
+    begin_departure(state)
+    assert state["departure"]["since"] == NEVER
+
+
+@pytest.mark.parametrize("place", [("recovery", "reset_stamp"), ("trust", "doubt_stamp")])
+def test_a_reset_turns_the_axes_below_the_motion(place: tuple[str, str]) -> None:
+    state = make_state()
+    state["stamp"] = 100 * SECOND
+    begin_departure(state)
+    state["stamp"] += SECOND // 5
+    extend_departure(state)
+    assert state["departure"]["bins"] == 1
+    state[place[0]][place[1]] = state["stamp"]
+    state["stamp"] += SECOND // 5
+    extend_departure(state)
+    assert state["departure"]["since"] == NEVER
+
+
+def test_the_lag_is_said_and_published_until_turns_tell() -> None:
+    state = depart(1.2)
+    assert lag_of_receiver(state) == pytest.approx(1.2, abs=0.1)
+    assert [text for text in motion_complaints(state) if "set out from rest" in text and "1.2 s later" in text]
+    turns = state["motion"]["turns"]
+    turns["count"], turns["weight"], turns["course_square"] = 2 * FEWEST_TURNS, 1e4, 1e4
+    state["motion"]["heard_stamp"] = state["stamp"]
+    assert lag_of_receiver(state) == 0.0
+    turns["lag"] = -0.8
+    assert lag_of_receiver(state) == -0.8
+    assert not [text for text in motion_complaints(state) if "set out from rest" in text]
