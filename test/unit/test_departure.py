@@ -11,6 +11,7 @@ import pytest
 from eskf_ros.filter.history.records import AID, XX, YY
 from eskf_ros.filter.inertial.covariance import ACCELERATION_TIME
 from eskf_ros.filter.integrity.departure import (
+    add_heard,
     begin_departure,
     extend_departure,
     hear_fix,
@@ -94,6 +95,41 @@ def test_without_a_lag_none_is_found(acceleration: float, error: float, has_velo
     """Nor where the level was found while the robot braked, so that its acceleration is wrong."""
     for fix_std in (1.0, 0.02):
         assert depart(0.0, acceleration, has_velocity, error, fix_std, seed)["departure"]["lag"] == 0.0
+
+
+@pytest.mark.parametrize("has_velocity", [True, False])
+@pytest.mark.parametrize(("lag", "acceleration"), [(1.2, 0.5), (6.0, 2.0)])
+def test_a_lag_that_hardly_shows_or_is_too_long_is_not_told(
+    lag: float, acceleration: float, has_velocity: bool
+) -> None:
+    """0.6 m/s of difference may come from elsewhere; after 6 s nothing has been heard that fits."""
+    assert depart(lag, acceleration, has_velocity)["departure"]["lag"] == 0.0
+
+
+def test_braking_before_the_rest_is_no_motion_in_it() -> None:
+    """What the low-passed acceleration still holds of it fades, and is no change of the speed."""
+    state, decay = make_state(), math.exp(-0.01 / ACCELERATION_TIME)
+    state["excitation"]["acceleration"] = (-1.5, 0.5, 0.0)
+    begin_departure(state)
+    for k in range(1, 501):
+        state["stamp"] = k * 10_000_000
+        state["excitation"]["acceleration"] *= decay
+        extend_departure(state)
+    departure = state["departure"]
+    assert departure["bins"] >= 24
+    assert departure["by_imu"][:24, 0].max() < 0.02
+
+
+def test_noise_does_not_make_a_length_longer() -> None:
+    departure = make_state()["departure"]
+    departure["since"] = 0
+    rng = np.random.default_rng(0)
+    squares = []
+    for _ in range(2000):
+        departure["count"] = 0
+        add_heard(departure, SECOND, math.hypot(2.0 + rng.normal(), rng.normal()), 1.0)
+        squares.append(departure["heard"][0, 1] ** 2)
+    assert np.mean(squares) == pytest.approx(4.0, rel=0.1)
 
 
 def test_a_later_departure_without_a_lag_takes_it_back() -> None:

@@ -32,7 +32,7 @@ HEARD_INTERVAL = 0.15
 """s; messages that follow sooner are left out."""
 
 LARGEST_LAG = 3.0
-"""s; lags up to here are tried, to both sides. One that fits best at this end is not known."""
+"""s; lags up to here are tried, to both sides."""
 
 LAG_STEP = 0.1
 """s; step between the lags that are tried."""
@@ -214,8 +214,7 @@ def update_lag(departure):
                 lag, most, left_most, count_most = side * k * LAG_STEP, none - left, left, count
                 shift = length_by_imu(departure, last, column)
                 shift -= length_by_imu(departure, last - abs(lag), column)
-    is_within = abs(lag) < LARGEST_LAG - 0.5 * LAG_STEP
-    if is_within and most > SHOWN and left_most < FITS * count_most and shift > LEAST_SHIFT[column]:
+    if most > SHOWN and left_most < FITS * count_most and shift > LEAST_SHIFT[column]:
         departure.lag = lag if abs(lag) > NOTABLE_LAG else 0.0
 
 
