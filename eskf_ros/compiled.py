@@ -152,9 +152,17 @@ def _prune(module: str) -> None:
     """Remove the machine code of old versions of a module."""
     assert CACHE_FOLDER is not None
     folders = [f for f in CACHE_FOLDER.glob(f"{module}.*") if f.name.rpartition(".")[0] == module]
-    folders.sort(key=lambda folder: folder.stat().st_mtime, reverse=True)
+    folders.sort(key=_changed, reverse=True)
     for folder in folders[KEPT_VERSIONS - 1 :]:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def _changed(folder: Path) -> float:
+    """Return when a folder was last changed (s); long ago if another process, that starts, too, has removed it."""
+    try:
+        return folder.stat().st_mtime
+    except FileNotFoundError:
+        return 0.0
 
 
 @contextlib.contextmanager

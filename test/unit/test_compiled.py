@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -52,3 +53,17 @@ def test_numba_copies_as_it_does_by_itself_once_we_have_compiled() -> None:
     with compiled._frugally(), compiled._frugally():
         assert inline_closurecall.copy is not copy
     assert inline_closurecall.copy is copy
+
+
+def test_processes_that_start_together_may_remove_the_same_old_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each removes the code of old versions of a module, while the other looks at it."""
+    monkeypatch.setattr(compiled, "CACHE_FOLDER", tmp_path)
+    for round_ in range(20):
+        for k in range(100):
+            (tmp_path / f"filter.loop.{round_}-{k}").mkdir()
+        with ThreadPoolExecutor(4) as threads:
+            for done in [threads.submit(compiled._prune, "filter.loop") for _ in range(4)]:
+                done.result()
+    assert 0 < len(list(tmp_path.iterdir())) < compiled.KEPT_VERSIONS
