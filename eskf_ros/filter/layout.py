@@ -220,6 +220,7 @@ WORK = np.dtype(
         ("gain", "f8", (ERROR_CAPACITY, 3)),
         ("residual_gain", "f8", (ERROR_CAPACITY, 3)),
         ("correction", "f8", (ERROR_CAPACITY,)),
+        ("missed", "f8", (3,)),
         # The signals of one epoch, and their least squares (see ``tight``).
         ("signal_count", "i8"),
         ("signal_index", "i8", (LARGEST_EPOCH,)),

@@ -65,6 +65,26 @@ def to_rotation_vector(q):
 
 
 @njit
+def left_jacobian(v):
+    """Return the left Jacobian of a rotation vector (rad), as row tuples.
+
+    It turns what is constant in axes that turn by ``v`` meanwhile, on the average (Sola, Deray and Atchuthan, A micro
+    Lie theory for state estimation in robotics, 2018, eq. 145).
+    """
+    square = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    angle = math.sqrt(square)
+    first, second = 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
+    if angle > 1e-3:
+        first, second = (1.0 - math.cos(angle)) / square, (angle - math.sin(angle)) / (square * angle)
+    x, y, z = v[0], v[1], v[2]
+    return (
+        (1.0 - second * (y * y + z * z), second * x * y - first * z, second * x * z + first * y),
+        (second * x * y + first * z, 1.0 - second * (x * x + z * z), second * y * z - first * x),
+        (second * x * z - first * y, second * y * z + first * x, 1.0 - second * (x * x + y * y)),
+    )
+
+
+@njit
 def to_matrix(q):
     """Return the rotation matrix of a unit quaternion as three row tuples (Sola, eq. 115)."""
     w, x, y, z = q[0], q[1], q[2], q[3]

@@ -8,11 +8,11 @@ transition F of the errors between nodes, and smoothed x_s, P_s (Sarkka, Bayesia
     P_s(k) = P+(k) + C (P_s(k+1) - P-(k+1)) C'
 
 The differences count from the predicted state: what the filter injected at the node is part of them. Its reset turns
-the axes of the attitude error; the log has the matrix G of it, and the smoothed errors go back by its inverse. So the
-pass is linear in errors about the trajectory of the filter, whatever force the filter believed and however it resets.
-Where the filter did something else than to predict and to update (`output.forward_log`), the smoothed state is the
-filter's own and the recursion begins anew. An augmented state that was reset tells nothing of its past: it is left out
-of P- there.
+the axes of the errors of position, velocity and attitude; the log has the matrix G of it, and the smoothed errors go
+back by its inverse. So the pass is linear in errors about the trajectory of the filter, whatever force the filter
+believed and however it resets. Where the filter did something else than to predict and to update
+(`output.forward_log`), the smoothed state is the filter's own and the recursion begins anew. An augmented state that
+was reset tells nothing of its past: it is left out of P- there.
 """
 
 from __future__ import annotations
@@ -37,11 +37,13 @@ from eskf_ros.filter.state.error_state import (
     ERROR_CAPACITY,
     ERROR_SIZE,
     OPTIONAL_CAPACITY,
+    POSITION,
     VELOCITY,
 )
 from eskf_ros.geodesy.rotation import (
     cross,
     dot,
+    left_jacobian,
     multiply,
     rotate,
     to_rotation_vector,
@@ -243,18 +245,23 @@ def go_before(p, node, row):
     injected = (row[AFTER + 6], row[AFTER + 7], row[AFTER + 8], row[AFTER + 9])
     before = (row[BEFORE + 6], -row[BEFORE + 7], -row[BEFORE + 8], -row[BEFORE + 9])
     turn = to_rotation_vector(multiply(injected, before))
-    change = rotate(back, (p.change[ATTITUDE], p.change[ATTITUDE + 1], p.change[ATTITUDE + 2]))
-    for i in range(3):
-        p.correction[i] = p.change[i] + row[AFTER + i] - row[BEFORE + i]
-        p.correction[VELOCITY + i] = p.change[VELOCITY + i] + row[AFTER + 3 + i] - row[BEFORE + 3 + i]
-        p.correction[ATTITUDE + i] = change[i] + turn[i]
+    turning = inverse_of(left_jacobian(turn))
+    for block in (POSITION, VELOCITY, ATTITUDE):
+        change = rotate(back, (p.change[block], p.change[block + 1], p.change[block + 2]))
+        step = turn
+        if block != ATTITUDE:
+            a, b = AFTER + block, BEFORE + block
+            step = rotate(turning, (row[a] - row[b], row[a + 1] - row[b + 1], row[a + 2] - row[b + 2]))
+        for i in range(3):
+            p.correction[block + i] = change[i] + step[i]
     for i in range(ACCEL_BIAS, size):
         # Biases and augmented states: a nominal attitude has four numbers.
         p.correction[i] = p.change[i] + row[AFTER + i + 1] - row[BEFORE + i + 1]
     for i in range(size):
         for j in range(size):
             p.added[i, j] = p.covariance[i, j]
-    update_error_axes(p.added, ATTITUDE, back)
+    for block in (POSITION, VELOCITY, ATTITUDE):
+        update_error_axes(p.added, block, back)
     for i in range(size):
         for j in range(size):
             p.added[i, j] -= p.predicted[i, j]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from eskf_ros.compiled import njit
 from eskf_ros.filter.output.global_odometry import write_odometry
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, VELOCITY
-from eskf_ros.geodesy.rotation import from_rotation_vector, multiply, normalized
+from eskf_ros.geodesy.rotation import from_rotation_vector, left_jacobian, multiply, normalized, rotate
 from eskf_ros.smooth.backward import CORRECTION_AFTER, CORRECTION_BEFORE, SMOOTHED_AFTER, SMOOTHED_BEFORE
 
 
@@ -63,13 +63,15 @@ def correct_point(state, point, begin, end, share, duration):
     for i in range(3):
         p, v, a, g = POSITION + i, VELOCITY + i, ACCEL_BIAS + i, GYRO_BIAS + i
         state.position_map[i] = (
-            point.position_map[i]
-            + at_begin * begin[b + p]
-            + at_end * end[e + p]
-            + slope_begin * begin[b + v]
-            + slope_end * end[e + v]
+            at_begin * begin[b + p] + at_end * end[e + p] + slope_begin * begin[b + v] + slope_end * end[e + v]
         )
-        state.velocity_map[i] = point.velocity_map[i] + rest * begin[b + v] + share * end[e + v]
+        state.velocity_map[i] = rest * begin[b + v] + share * end[e + v]
         state.accel_bias[i] = point.accel_bias[i] + rest * begin[b + a] + share * end[e + a]
         state.gyro_bias[i] = point.gyro_bias[i] + rest * begin[b + g] + share * end[e + g]
         state.angular_rate[i] = point.angular_rate[i]
+    # The corrections of position and velocity are injected as those of the filter (`kalman_update`).
+    turning = left_jacobian(turn)
+    step, change = rotate(turning, state.position_map), rotate(turning, state.velocity_map)
+    for i in range(3):
+        state.position_map[i] = point.position_map[i] + step[i]
+        state.velocity_map[i] = point.velocity_map[i] + change[i]

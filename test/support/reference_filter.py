@@ -40,6 +40,36 @@ def cross(a: Any, b: Any) -> Array:
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
+def mean_rotation(turn: Any) -> Array:
+    """Return the mean of exp(s [turn]x) over s from 0 to 1, by its power series."""
+    matrix, term, total = skew(turn), EYE, EYE
+    for order in range(2, 20):
+        term = term @ matrix / order
+        total = total + term
+    return total
+
+
+def correction_by(gain: Any, h: Any, innovation: Any, iterations: int = 10) -> Array:
+    """Return the correction by a measurement: position and velocity in axes that turn with the attitude meanwhile.
+
+    What they change less by than the gain says counts again, until they meet the measurement all the same.
+    """
+    met = innovation
+    for _ in range(iterations):
+        error = gain @ met
+        turned = error.copy()
+        turned[:6] = np.kron(np.eye(2), mean_rotation(error[6:9])) @ error[:6]
+        met = innovation + h @ (error - turned)
+    return np.asarray(turned)
+
+
+def reset_by(turn: Any, size: int) -> Array:
+    """Return the matrix by which the errors of position, velocity and attitude turn with a corrected heading."""
+    matrix = np.eye(size)
+    matrix[:9, :9] = np.kron(EYE, exponential(turn))
+    return matrix
+
+
 def exponential(turn: Any) -> Array:
     """Return exp([turn]x) (Rodrigues), exact near zero too."""
     angle = math.sqrt(turn @ turn)
@@ -262,7 +292,7 @@ class ReferenceFilter:
         gain = np.linalg.solve(s, h @ self.covariance).T
         keep = np.eye(len(self.covariance)) - gain @ h
         covariance = keep @ self.covariance @ keep.T + gain @ noise @ gain.T
-        error = gain @ innovation
+        error = correction_by(gain, h, innovation)
         self.p = self.p + error[P]
         self.v = self.v + error[V]
         self.r = exponential(error[T]) @ self.r
@@ -271,8 +301,7 @@ class ReferenceFilter:
         self.x = self.x + error[15:]
         g = self.gravity_map(self.p)
         up = -g / math.sqrt(g @ g)
-        reset = np.eye(len(covariance))
-        reset[T, T] = exponential(up @ error[T] * up)
+        reset = reset_by(up @ error[T] * up, len(covariance))
         covariance = reset @ covariance @ reset.T
         self.covariance = (covariance + covariance.T) / 2.0
 

@@ -115,3 +115,12 @@ def test_roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> None:
 def test_products(a: tuple[float, float, float], b: tuple[float, float, float]) -> None:
     np.testing.assert_allclose(rotation.cross(a, b), np.cross(a, b), rtol=0.0, atol=1e-15)
     np.testing.assert_allclose(rotation.dot(a, b), np.dot(a, b), rtol=0.0, atol=1e-15)
+
+
+@given(rotation_vectors)
+def test_left_jacobian_is_the_mean_of_a_turn_on_its_way(v: Array) -> None:
+    """By Gauss-Legendre quadrature, and without a step where the series takes over."""
+    nodes, weights = np.polynomial.legendre.leggauss(16)
+    shares = 0.5 * (nodes + 1.0)
+    expected = np.einsum("n,nij->ij", 0.5 * weights, Rotation.from_rotvec(shares[:, None] * v).as_matrix())
+    np.testing.assert_allclose(matrix_of(rotation.left_jacobian(tuples(v))), expected, rtol=0.0, atol=1e-12)

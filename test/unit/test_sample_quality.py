@@ -104,9 +104,14 @@ def test_a_filled_hole_costs_what_a_hole_costs(kind: str) -> None:
     assert sentence.startswith("1 holes in the IMU data are filled")
 
 
-def test_while_standing_a_repeated_sample_costs_nothing() -> None:
-    _, widened = run(filled("repeated"), speed=(0.0, 0.0, 0.0))
-    assert not widened.any()
+@pytest.mark.parametrize("is_turning", [False, True])
+def test_while_standing_a_repeated_sample_costs_nothing(is_turning: bool) -> None:
+    """But where it turns, a robot does not stand, however slow it is."""
+    values = filled("repeated")
+    values[:, 5] -= 0.0 if is_turning else 0.25 * np.sin(0.5 * np.arange(len(values)) / RATE)
+    values[HOLE, 5] = values[HOLE.start, 5]
+    _, widened = run(values, speed=(0.0, 0.0, 0.0))
+    assert widened.any() == is_turning
 
 
 @pytest.mark.parametrize("quantum", [0.0, 0.3, 1.0, 3.0, 10.0])

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from eskf_ros.filter.history.records import AID, RECORD
-from eskf_ros.filter.measurements.kalman_update import update
+from eskf_ros.filter.measurements.kalman_update import ITERATIONS, update
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.filter.state.enums import CONSTRAINT_INTERVAL, Stream, Verdict
 from eskf_ros.filter.state.memory import allocate
@@ -24,6 +24,7 @@ from eskf_ros.simulate.wheel import WheelOdometer
 from monte_carlo import BLOCKS, nees
 from support.aided import run
 from support.kernels import copy_of, core, make_settings, make_state, make_work, random_covariance
+from support.reference_filter import correction_by, reset_by
 
 Array = NDArray[np.float64]
 
@@ -53,11 +54,11 @@ def test_update_with_shared_noise_is_that_of_the_joint_filter(seed: int) -> None
     verdict, nis = update(state, 3, 1e300, work)
     assert verdict == Verdict.FUSED
     assert nis == pytest.approx(work["innovation"] @ np.linalg.solve(spread, work["innovation"]))
-    np.testing.assert_allclose(state["position_map"], (gain @ work["innovation"])[:3], rtol=1e-9, atol=1e-12)
-    # The attitude's part was turned by the reset.
-    rest = np.r_[0:6, 9:15]
-    expected = (joint - gain @ both @ joint)[np.ix_(rest, rest)]
-    np.testing.assert_allclose(core(state)[np.ix_(rest, rest)], expected, rtol=0.0, atol=1e-10)
+    correction = correction_by(gain[:15], jacobian, work["innovation"], ITERATIONS)
+    np.testing.assert_allclose(state["position_map"], correction[:3], rtol=1e-9, atol=1e-12)
+    turned = reset_by(np.array([0.0, 0.0, correction[8]]), 15)
+    expected = turned @ (joint - gain @ both @ joint)[:15, :15] @ turned.T
+    np.testing.assert_allclose(core(state), expected, rtol=0.0, atol=1e-8)
 
 
 # --------------------------------------------------------------------------------------------------------- the evidence

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,12 @@ from eskf_ros.filter.fuse import fuse
 from eskf_ros.filter.history.records import AID
 from eskf_ros.filter.inertial.strapdown import gravity_map
 from eskf_ros.filter.layout import blank_state
-from eskf_ros.filter.measurements.kalman_update import invert_positive, update, update_nominal_state
+from eskf_ros.filter.measurements.kalman_update import (
+    ITERATIONS,
+    invert_positive,
+    update,
+    update_nominal_state,
+)
 from eskf_ros.filter.state.enums import Stream, Verdict
 from eskf_ros.filter.state.memory import allocate
 from support.kernels import (
@@ -34,6 +40,7 @@ from support.kernels import (
     tuples,
     with_error,
 )
+from support.reference_filter import correction_by, reset_by
 
 Array = NDArray[np.float64]
 
@@ -57,22 +64,27 @@ def measurement(seed: int, size: int, noise_std: float = 0.5) -> Any:
 
 
 def dense_update(covariance: Array, work: Any, size: int) -> tuple[Array, Array, float]:
-    """Return correction, Joseph covariance before the reset, normalised innovation squared; all by matrices."""
+    """Return correction, Joseph covariance before the reset, normalised innovation squared; all by matrices.
+
+    Position and velocity are corrected in axes that turn with the attitude: what they change less counts again.
+    """
     h, z = work["jacobian"][:size, :15].copy(), work["innovation"][:size].copy()
     r = work["noise"][:size, :size].copy()
     s = h @ covariance @ h.T + r
     gain = np.linalg.solve(s, h @ covariance).T
     keep = np.eye(15) - gain @ h
-    return gain @ z, keep @ covariance @ keep.T + gain @ r @ gain.T, float(z @ np.linalg.solve(s, z))
+    return (
+        correction_by(gain, h, z, ITERATIONS),
+        keep @ covariance @ keep.T + gain @ r @ gain.T,
+        float(z @ np.linalg.solve(s, z)),
+    )
 
 
 def reset(state: Any, correction: Array) -> Array:
-    """The tilt error turns about the vertical with the heading: R_true = exp(heading) exp(tilt) R."""
+    """All but biases turns about the vertical with the heading: R_true = exp(heading) exp(tilt) R."""
     up = -np.array(gravity_map(state, tuples(state["position_map"])))
     up /= np.linalg.norm(up)
-    matrix = np.eye(15)
-    matrix[6:9, 6:9] = Rotation.from_rotvec((up @ correction[6:9]) * up).as_matrix()
-    return matrix
+    return reset_by((up @ correction[6:9]) * up, 15)
 
 
 @settings(max_examples=150)
@@ -123,6 +135,33 @@ def test_reset_of_a_large_correction_of_the_heading() -> None:
     true = Rotation.from_rotvec(0.8 * up) * Rotation.from_rotvec(tilt) * to_rotation(before["attitude"])
     left = (true * to_rotation(state["attitude"]).inv()).as_rotvec()
     np.testing.assert_allclose(core(state)[6:9, 6:9], np.outer(left, left), rtol=0.0, atol=1e-8)
+
+
+@pytest.mark.parametrize("turn_deg", [-60.0, 5.0, 40.0])
+def test_a_velocity_tells_the_heading_of_an_acceleration_along_the_arc(turn_deg: float) -> None:
+    """A robot has sped up from rest by 10 m/s in an unknown direction: one velocity tells which, exactly.
+
+    A filter whose errors are on the tangent finds the sine of the turn, 50 degrees of 60, and is sure of it to 0.1.
+    """
+    speed, turn, heading_std, velocity_std = 10.0, math.radians(turn_deg), math.radians(40.0), 0.02
+    state = make_state(velocity=(speed, 0.0, 0.0))
+    p = core(state)
+    p[:] = 1e-8 * np.eye(15)
+    root = np.zeros(15)
+    root[4], root[8] = speed * heading_std, heading_std
+    p += np.outer(root, root)
+    work = make_work()
+    true = speed * np.array([math.cos(turn), math.sin(turn)])
+    work["jacobian"][:2, 3:5] = np.eye(2)
+    work["innovation"][:2] = true - (speed, 0.0)
+    work["noise"][:2, :2] = velocity_std**2 * np.eye(2)
+    assert update(state, 2, OPEN_GATE, work)[0] == Verdict.FUSED
+    found = to_rotation(state["attitude"]).as_rotvec()[2]
+    assert abs(found - turn) < math.radians(1.5)
+    np.testing.assert_allclose(state["velocity_map"][:2], true, atol=0.3)
+    # What is left of the error of the heading is one across the velocity as it is now.
+    left = core(state)[3:5, 8] / core(state)[8, 8]
+    np.testing.assert_allclose(left, speed * np.array([-math.sin(turn), math.cos(turn)]), atol=0.3)
 
 
 def test_corrections_of_the_tilt_say_nothing_of_the_heading() -> None:

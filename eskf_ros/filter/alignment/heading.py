@@ -178,9 +178,7 @@ def search_heading(state, aid, gate, settings, work):
     set_east_north_up_covariance(work.noise, state, local_to_ecef, aid.payload, 3)
     if aid.stream == Stream.GNSS_POSITION:
         turn, std = turn_from_spot(state, measured, aid.source, settings, work)
-        found, found_std = turn_found(state)
-        does_agree = found_std == math.inf or abs(wrapped(turn - found)) < CERTAIN * math.hypot(std, found_std)
-        if std <= settings.found_heading_std and does_agree:
+        if std <= settings.found_heading_std:
             begin_with_heading(state, heading_of(state, settings) + turn, std, settings)
             return
     search_with(state, first, measured, lever, gate, settings, work)

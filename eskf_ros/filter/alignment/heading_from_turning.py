@@ -4,7 +4,8 @@ A robot that turns where it stands accelerates too little for the search, but th
 the axis tells the heading as well as its fixes tell the circle. Antenna = centre + lever arm from base_link, turned by
 the unknown heading: linear in the centre, the cosine and the sine. The centre may creep (`CENTRE_WALK`) but does not
 drive; a robot that drives does not fit, and the estimate begins anew. That the length of (cos, sin) comes out as one,
-the radius of the circle as the lever arm, tells that the model holds.
+the radius of the circle as the lever arm, tells that the model holds; so does the search, which assumes no standing: it
+must see neither a drive nor another turn.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.alignment.heading_search import LENGTH_TOLERANCE
+from eskf_ros.filter.alignment.heading_search import LENGTH_TOLERANCE, agrees_with_search, has_moved, nis_of_pair
+from eskf_ros.filter.inertial.navigation_frame import body_rate
 from eskf_ros.filter.state.error_state import GYRO_BIAS
 from eskf_ros.filter.state.time import NEVER
-from eskf_ros.geodesy.rotation import rotate, rotate_back, to_matrix
+from eskf_ros.geodesy.rotation import dot, rotate, rotate_back, to_matrix
 
 STATES = 4
 """Centre (m, east and north), cosine and sine of the turn from the level axes to the map."""
@@ -36,6 +38,9 @@ SPOT = np.dtype(
 
 CENTRE_WALK = 0.003
 """m/rtHz; how fast the centre creeps: tracks and tyres slip."""
+
+FASTEST_CREEP = 0.3
+"""m/s; a robot that is certainly faster, where the turn alone does not move its IMU, drives."""
 
 SPOT_GATE = 13.8
 """Gate of a fix (NIS): the chi-square quantile of probability 0.999 with 2 degrees of freedom."""
@@ -67,7 +72,8 @@ def turn_from_spot(state, measured, source, settings, work):
         return 0.0, math.inf
     spot = state.spot
     dt = (state.stamp - spot.stamp) * 1e-9
-    if spot.stamp == NEVER or state.stamp - spot.stamp > LONGEST_SILENCE or spot.misses >= MISSES:
+    is_stale = spot.stamp == NEVER or state.stamp - spot.stamp > LONGEST_SILENCE
+    if is_stale or spot.misses >= MISSES or is_driving(state, base):
         begin_spot(spot, state.stamp, measured, work.noise, lever)
         return 0.0, math.inf
     spot.stamp = state.stamp
@@ -105,7 +111,16 @@ def turn_from_spot(state, measured, source, settings, work):
             x[i] += column[i] / total * innovation
             for j in range(STATES):
                 p[i, j] -= column[i] * column[j] / total
+    if not agrees_with_search(state, x[2], x[3], (p[2, 2], p[2, 3], p[3, 3])):
+        return 0.0, math.inf
     return decided(x, p)
+
+
+@njit
+def is_driving(state, base):
+    """Say whether the search sees the IMU, ``base`` (m) from the point that stands, move faster than by the turn."""
+    rate = body_rate(state, to_matrix(state.attitude))
+    return has_moved(state, FASTEST_CREEP + math.sqrt(dot(rate, rate) * dot(base, base)))
 
 
 @njit
@@ -141,10 +156,7 @@ def nis_of(p, lever, excess, variance):
     snn += lever[1] ** 2 * p[2, 2] + 2.0 * lever[0] * lever[1] * p[2, 3] + lever[0] ** 2 * p[3, 3]
     sen = p[0, 1] + lever[1] * p[0, 2] + lever[0] * p[0, 3] + lever[0] * p[1, 2] - lever[1] * p[1, 3]
     sen += lever[0] * lever[1] * (p[2, 2] - p[3, 3]) + (lever[0] ** 2 - lever[1] ** 2) * p[2, 3]
-    determinant = see * snn - sen * sen
-    if not determinant > 0.0:
-        return math.inf
-    return (snn * excess[0] ** 2 - 2.0 * sen * excess[0] * excess[1] + see * excess[1] ** 2) / determinant
+    return nis_of_pair(excess[0], excess[1], see, sen, snn)
 
 
 @njit

@@ -73,6 +73,9 @@ body turns about this axis instead of turning it.
 LENGTH_TOLERANCE = 0.1
 """The length of (cos, sin) must not differ from one by more than this plus three standard deviations."""
 
+CHANCE_GATE = 9.21
+"""NIS of two errors up to which they may be chance: the 0.99 quantile of chi-square with 2 degrees of freedom."""
+
 LENGTH_STD = 0.25
 """The heading is undecided while the standard deviation of the length of (cos, sin) exceeds this."""
 
@@ -242,10 +245,7 @@ def update_search(state, first, measured, lever, noise, gate, work):
     sen = east[first + 1] + h[1][0] * east[4] + h[1][1] * east[5] + noise[0, 1]
     snn = north[first + 1] + h[1][0] * north[4] + h[1][1] * north[5] + noise[1, 1]
     determinant = see * snn - sen * sen
-    if not determinant > 0.0:
-        return
-    nis = (snn * innovation_e**2 - 2.0 * sen * innovation_e * innovation_n + see * innovation_n**2) / determinant
-    if nis > gate:
+    if nis_of_pair(innovation_e, innovation_n, see, sen, snn) > gate:
         return
     for i in range(SEARCH_SIZE):
         gain_e = (snn * east[i] - sen * north[i]) / determinant
@@ -269,6 +269,37 @@ def turn_found(state):
     if along > LENGTH_STD or abs(length - 1.0) > LENGTH_TOLERANCE + 3.0 * along:
         return 0.0, math.inf
     return math.atan2(s, c), across / length
+
+
+@njit
+def has_moved(state, slowest):
+    """Say whether the search has a velocity above ``slowest`` (m/s) that is not chance."""
+    if state.search.started == 0:
+        return False
+    east, north = state.search.estimate[2], state.search.estimate[3]
+    p = state.search.covariance
+    is_fast = east * east + north * north > slowest * slowest
+    return is_fast and nis_of_pair(east, north, p[2, 2], p[2, 3], p[3, 3]) > CHANCE_GATE
+
+
+@njit
+def agrees_with_search(state, cosine, sine, variances):
+    """Say whether another estimate of (cos, sin) is that of the search, as far as both know it.
+
+    ``variances`` (3,): of the cosine, of both, of the sine.
+    """
+    if state.search.started == 0:
+        return True
+    x, p, c = state.search.estimate, state.search.covariance, COSINE
+    xx, xy, yy = variances[0] + p[c, c], variances[1] + p[c, c + 1], variances[2] + p[c + 1, c + 1]
+    return nis_of_pair(cosine - x[c], sine - x[c + 1], xx, xy, yy) <= CHANCE_GATE
+
+
+@njit
+def nis_of_pair(x, y, xx, xy, yy):
+    """Return the normalised square of a vector (``x``, ``y``) of covariance ((xx, xy), (xy, yy))."""
+    determinant = xx * yy - xy * xy
+    return (yy * x * x - 2.0 * xy * x * y + xx * y * y) / determinant if determinant > 0.0 else math.inf
 
 
 @njit

@@ -69,7 +69,7 @@ def watch_axis(state, quality, i, reading, instant, interval, settings):
         return
     bias = state.accel_bias[i] if i < 3 else state.gyro_bias[i - 3]
     is_turning = i >= 3 and abs(reading - bias) > TURNING
-    if not is_clipped and not is_turning and is_standing(state):
+    if not is_clipped and is_standing(state):
         return
     begin, end = quality.equal_paid[i], quality.equal_time[i]
     is_clipped = is_clipped or reading <= quality.lowest[i] or reading >= quality.highest[i]
@@ -117,7 +117,13 @@ def is_usual(quality, share, usual, count):
 
 @njit
 def is_standing(state):
-    """Say whether the robot is estimated to stand, or has not been seen to move while its heading is unknown."""
+    """Say whether the robot is estimated to stand, or has not been seen to move while its heading is unknown.
+
+    One that turns in place does not stand.
+    """
+    for i in range(3):
+        if abs(state.imu.rate[i] - state.gyro_bias[i]) > TURNING:
+            return False
     if state.heading_known == 0:
         return state.window.motion_stamp == NEVER or state.stamp - state.window.motion_stamp > SEEN_LATELY
     v = state.velocity_map

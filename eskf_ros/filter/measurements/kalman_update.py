@@ -11,7 +11,22 @@ from eskf_ros.filter.inertial.covariance import turn_rows, update_error_axes
 from eskf_ros.filter.inertial.navigation_frame import local_up
 from eskf_ros.filter.state.enums import Verdict
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_SIZE, GYRO_BIAS, POSITION, VELOCITY
-from eskf_ros.geodesy.rotation import dot, from_rotation_vector, multiply, normalized, rotate_back, to_matrix
+from eskf_ros.geodesy.rotation import (
+    dot,
+    from_rotation_vector,
+    left_jacobian,
+    multiply,
+    normalized,
+    rotate,
+    rotate_back,
+    to_matrix,
+)
+
+ITERATIONS = 4
+"""Estimates of the errors by one measurement, at most. What is missed becomes less by half of the turn (rad) each."""
+
+SMALL_TURN = 1e-6
+"""rad; a smaller correction of the attitude turns nothing."""
 
 TURNING_RATE = 0.1
 """rad/s; beyond it the robot turns, whatever the bias of its gyro."""
@@ -69,14 +84,38 @@ def apply(state, size, work):
             work.gain[i, a] = gain
     if work.holds_heading == 1 and not is_heading_shown(state):
         hold_heading(state, size, work)
-    for i in range(state.error_size):
-        correction = 0.0
-        for a in range(size):
-            correction += work.gain[i, a] * work.innovation[a]
-        work.correction[i] = correction
+    compute_correction(state, size, work)
     update_covariance(state, size, work)
     update_nominal_state(state, work.correction)
-    reset_attitude_error(state, work.correction)
+    reset_errors(state, work.correction)
+
+
+@njit
+def compute_correction(state, size, work):
+    """Write the estimate of the errors to ``work.correction``.
+
+    Position and velocity are corrected in axes that turn with the attitude meanwhile (`reset_errors`), so that the
+    measurement is not met by as much (``work.missed``). It counts again, until the turn is small: the iterated update
+    of Bell and Cathey (The iterated Kalman filter update as a Gauss-Newton method, 1993), whose gain is kept.
+    """
+    c, missed = work.correction, work.missed
+    missed.fill(0.0)
+    for _ in range(ITERATIONS):
+        for i in range(state.error_size):
+            c[i] = 0.0
+            for a in range(size):
+                c[i] += work.gain[i, a] * (work.innovation[a] + missed[a])
+        missed.fill(0.0)
+        turn = (c[ATTITUDE], c[ATTITUDE + 1], c[ATTITUDE + 2])
+        turning = left_jacobian(turn)
+        for block in (POSITION, VELOCITY):
+            turned = rotate(turning, (c[block], c[block + 1], c[block + 2]))
+            for i in range(3):
+                for a in range(size):
+                    missed[a] += work.jacobian[a, block + i] * (c[block + i] - turned[i])
+                c[block + i] = turned[i]
+        if dot(turn, turn) < SMALL_TURN**2:
+            return
 
 
 @njit
@@ -112,19 +151,24 @@ def hold_heading(state, size, work):
 
 
 @njit
-def reset_attitude_error(state, correction):
-    """Turn the covariance of the attitude error about the vertical, by the correction of the heading.
+def reset_errors(state, correction):
+    """Turn the errors of position, velocity and attitude about the vertical, by the correction of the heading.
 
     R_true = exp(heading error) exp(tilt error) R. GNSS and gravity do not see a turn of all about the vertical: what
     stays unknown is a factor on the far left, whatever the tilt is corrected by, and its axis must stay the vertical.
     The Jacobian of the one rotation vector (Sola, section 6.3.1) tips it by half of each correction of the tilt; these
     corrections follow the noise of the gyro for ever, and the filter would learn the heading from it. The tilt error
     turns with a corrected heading, as the accelerometer bias does that it is correlated with.
+
+    So do the errors of position and velocity: an unknown heading enters them across the acceleration, whose direction
+    on the map is turned with the heading. About the vertical the error is that of the left-invariant filter (Barrau and
+    Bonnabel, The invariant extended Kalman filter as a stable observer, 2017).
     """
     up = local_up(state)
     angle = dot(up, (correction[ATTITUDE], correction[ATTITUDE + 1], correction[ATTITUDE + 2]))
     turn = to_matrix(from_rotation_vector((angle * up[0], angle * up[1], angle * up[2])))
-    update_error_axes(state.covariance, ATTITUDE, turn)
+    for block in (POSITION, VELOCITY, ATTITUDE):
+        update_error_axes(state.covariance, block, turn)
     turn_rows(state.forward.reset, 0, turn)
 
 

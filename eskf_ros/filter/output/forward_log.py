@@ -2,7 +2,7 @@
 
 Nothing is kept unless somebody asks for it (``settings.keeps_log``). A node is a stamp at which measurements changed
 the estimate, or `LONGEST_INTERVAL` after the last one: nominal state and covariance before and after them, the matrix
-by which resets turned the attitude error in between, and the transition matrix of the errors from the node before. A
+by which resets turned the errors in between, and the transition matrix of the errors from the node before. A
 point is the nominal state at an output stamp, before the measurements of that stamp. Where the log stands is part of
 the state, so a rewind takes back what it makes wrong.
 
@@ -52,7 +52,7 @@ FORWARD = np.dtype(
 - ``node_stamp``, ``breaks``, ``given_stamp``: of the last node: stamp (ns), and what must be the same for a link.
 - ``is_open``, ``breaks_before``, ``given_before``: whether a node waits for its end; the same before its measurements.
 - ``renewed``: augmented states that were reset, as bits.
-- ``reset``: product of the matrices by which updates turned the attitude error (`kalman_update.reset_attitude_error`).
+- ``reset``: product of the matrices by which updates turned the errors (`kalman_update.reset_errors`).
 - ``transition``: of the core; ``fade``: of each augmented state; ``clock_gain``: drift to bias of the clock (s).
 """
 
