@@ -112,7 +112,7 @@ def update_rest(state, settings):
         watch_input(state, window != Window.MOTION, settings)
         update_level(state, window, settings)
         if window == Window.REST:
-            begin_departure(state)
+            begin_departure(state, settings)
         close_static_window(state)
 
 

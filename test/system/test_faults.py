@@ -31,6 +31,19 @@ def run_named(name: str, given: Filter, seed: int = 3) -> Trace:
     return run_one(BY_NAME[name], recording_of(BY_NAME[name], seed), given)
 
 
+def test_a_heading_that_has_drifted_with_the_gyro_bias_is_not_called_wrong_from_the_start() -> None:
+    """Five minutes straight on: the course corrects it by 65 deg, as much as its sigma has allowed for."""
+    trace = run_named("motorway 10 min, straight", TOLD_VELOCITY, 20)
+    assert np.degrees(np.abs(trace.heading_error)).max() > 45.0
+    assert np.degrees(trace.heading_error[-1]) < 15.0
+    assert not [sentence for sentence in trace.final if "the heading that was given" in sentence]
+
+
+def test_an_imu_that_is_upside_down_is_not_taken_for_clocks_that_are_apart() -> None:
+    fault = BY_NAME["IMU upside down"]
+    assert figures_of(fault, run_named("IMU upside down", DEFAULT_POSITION, 1)).wrong == ()
+
+
 def test_names_of_faults_are_not_repeated_and_amplitudes_change_them() -> None:
     assert len(BY_NAME) == len(all_faults())
     larger = {fault.name: fault for fault in all_faults(2.0)}

@@ -21,7 +21,9 @@ from eskf_ros.filter.integrity.motion_monitor import lag_of_receiver
 from eskf_ros.filter.integrity.motion_report import motion_complaints
 from eskf_ros.filter.integrity.motion_sums import FEWEST_TURNS
 from eskf_ros.filter.state.time import NEVER, SECOND
-from support.kernels import make_state
+from support.kernels import make_settings, make_state
+
+SETTINGS = make_settings()
 
 VELOCITY_STD = 0.05
 """m/s per axis."""
@@ -61,7 +63,7 @@ def depart(
         low_passed += dt / ACCELERATION_TIME * (now - low_passed)
         state["excitation"]["acceleration"] = (0.6 * low_passed, 0.8 * low_passed, 0.0)
         if k in (0, 200):  # as each window of 2 s at rest ends
-            begin_departure(state)
+            begin_departure(state, SETTINGS)
         extend_departure(state)
         if k % 20:
             continue
@@ -110,7 +112,7 @@ def test_braking_before_the_rest_is_no_motion_in_it() -> None:
     """What the low-passed acceleration still holds of it fades, and is no change of the speed."""
     state, decay = make_state(), math.exp(-0.01 / ACCELERATION_TIME)
     state["excitation"]["acceleration"] = (-1.5, 0.5, 0.0)
-    begin_departure(state)
+    begin_departure(state, SETTINGS)
     for k in range(1, 501):
         state["stamp"] = k * 10_000_000
         state["excitation"]["acceleration"] *= decay
@@ -141,16 +143,23 @@ def test_a_later_departure_without_a_lag_takes_it_back() -> None:
 def test_a_level_that_is_not_known_says_nothing() -> None:
     state = make_state()
     state["covariance"][6, 6] = state["covariance"][7, 7] = math.radians(3.0) ** 2
-    begin_departure(state)
+    begin_departure(state, SETTINGS)
+    assert state["departure"]["since"] == NEVER
+
+
+def test_an_imu_that_is_upside_down_says_nothing() -> None:
+    state = make_state()
+    state["attitude"] = (0.0, 1.0, 0.0, 0.0)
+    begin_departure(state, SETTINGS)
     assert state["departure"]["since"] == NEVER
 
 
 def test_a_heading_that_was_given_may_be_corrected_below_the_motion() -> None:
     state = make_state()
-    begin_departure(state)
+    begin_departure(state, SETTINGS)
     assert state["departure"]["since"] == state["stamp"]
     state["heading_known"], state["heading"]["given_stamp"] = 1, SECOND
-    begin_departure(state)
+    begin_departure(state, SETTINGS)
     assert state["departure"]["since"] == NEVER
 
 
@@ -158,7 +167,7 @@ def test_a_heading_that_was_given_may_be_corrected_below_the_motion() -> None:
 def test_a_reset_turns_the_axes_below_the_motion(place: tuple[str, str]) -> None:
     state = make_state()
     state["stamp"] = 100 * SECOND
-    begin_departure(state)
+    begin_departure(state, SETTINGS)
     state["stamp"] += SECOND // 5
     extend_departure(state)
     assert state["departure"]["bins"] == 1

@@ -363,7 +363,7 @@ def test_swapped_antennas_are_named_when_they_are_the_only_source() -> None:
     """The motion refutes the heading that they gave, and then they are what differs from it."""
     recording, navigator = swapped(160.0)
     (sentence,) = [sentence for sentence in navigator.complaints if "dual antenna differ" in sentence]
-    assert abs(float(sentence.split("estimate by ")[1].split(" deg")[0]) - 180.0) < 10.0
+    assert abs(abs(float(sentence.split("estimate by ")[1].split(" deg")[0])) - 180.0) < 10.0
     assert "are the antennas swapped" in sentence
     assert abs(heading_error(recording, navigator)) < 4.0
 

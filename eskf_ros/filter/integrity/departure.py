@@ -14,10 +14,12 @@ import numpy as np
 from eskf_ros.compiled import njit
 from eskf_ros.filter.history.records import XX, YY
 from eskf_ros.filter.inertial.covariance import ACCELERATION_TIME
+from eskf_ros.filter.inertial.navigation_frame import local_up
 from eskf_ros.filter.integrity.motion_sums import NOTABLE_LAG
 from eskf_ros.filter.state.error_state import ATTITUDE
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.geodesy.earth import STANDARD_GRAVITY
+from eskf_ros.geodesy.rotation import dot, rotate, to_matrix
 
 BIN = 0.2
 """s; interval at which speed and way by the IMU are kept."""
@@ -43,6 +45,10 @@ been found while the robot still braked, or had begun to move."""
 
 FEWEST_AT_REST = 10.0
 """Fixes at rest, without which ways have no beginning."""
+
+LEAST_UPRIGHT = 0.5
+"""Cosine of the angle of base_link to the vertical, at least: an IMU that is mounted otherwise than is told turns the
+other way."""
 
 LEVEL_STD = 0.03
 """rad; of the tilt, up to which the level is known well enough."""
@@ -102,14 +108,17 @@ DEPARTURE = np.dtype(
 
 
 @njit
-def begin_departure(state):
+def begin_departure(state, settings):
     """Begin to watch: the robot is at rest, and level."""
     departure = state.departure
     if departure.since == NEVER or math.hypot(departure.way[0], departure.way[1]) > SET_OUT:
         departure.rest_fixes = 0.0
     tilt_variance = 0.5 * (state.covariance[ATTITUDE, ATTITUDE] + state.covariance[ATTITUDE + 1, ATTITUDE + 1])
     # While a heading that was given is corrected, the axes of map turn below the motion.
-    is_fit = tilt_variance < LEVEL_STD**2 and (state.heading_known == 0 or state.heading.given_stamp == NEVER)
+    m = settings.imu_to_base
+    upright = rotate(to_matrix(state.attitude), (m[2, 0], m[2, 1], m[2, 2]))
+    is_fit = tilt_variance < LEVEL_STD**2 and dot(upright, local_up(state)) > LEAST_UPRIGHT
+    is_fit = is_fit and (state.heading_known == 0 or state.heading.given_stamp == NEVER)
     departure.since = state.stamp if is_fit else NEVER
     departure.variance = ACCELERATION_STD**2 + tilt_variance * STANDARD_GRAVITY**2
     departure.bins = departure.count = departure.has_speed = 0

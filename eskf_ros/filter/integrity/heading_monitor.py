@@ -14,7 +14,7 @@ from eskf_ros.compiled import njit
 from eskf_ros.filter.history.records import XX, YY
 from eskf_ros.filter.integrity.scatter import has_calm_errors
 from eskf_ros.filter.state.enums import Stream
-from eskf_ros.filter.state.error_state import ATTITUDE, VELOCITY
+from eskf_ros.filter.state.error_state import ATTITUDE, GYRO_BIAS, VELOCITY
 from eskf_ros.filter.state.time import NEVER, SECOND
 from eskf_ros.geodesy.rotation import dot, wrapped
 
@@ -30,6 +30,8 @@ HEADING_MONITOR = np.dtype(
         ("given_stamp", "i8"),
         ("given_std", "f8"),
         ("given_off", "f8"),
+        ("given_wrong", "f8"),
+        ("given_bias_std", "f8"),
         ("given_moved", "i8"),
         ("explained", "i8", (2,)),
     ],
@@ -44,8 +46,10 @@ and of their weighed squares, how many there were, and the last one (ns). ``fiel
 inclination (rad) of the field last measured; ``disturbed_fields``, ``field_count``: disturbed readings, and all.
 
 ``given_stamp``, ``given_std``: when the heading was given that is watched (ns), and its standard deviation (rad).
-``given_off``: by how much measurements have turned it since (rad). ``given_moved``: when the robot first moved with it
-(ns). ``explained``: the takeovers of the humble lane and the departures of the first receiver meanwhile.
+``given_off``: by how much measurements have turned it since (rad); ``given_wrong``: from how much on it was wrong, and
+has not only drifted with the bias of the gyro (rad), whose standard deviation was at the least ``given_bias_std``
+(rad/s). ``given_moved``: when the robot first moved with it (ns). ``explained``: the takeovers of the humble lane and
+the departures of the first receiver meanwhile.
 """
 
 
@@ -157,10 +161,19 @@ def watch_given_heading(state, given_before, turned):
     if given_before not in (NEVER, monitor.given_stamp):
         monitor.given_std = math.sqrt(state.covariance[ATTITUDE + 2, ATTITUDE + 2])
         monitor.given_off = 0.0
+        monitor.given_wrong = wrong_by(monitor.given_std)
+        monitor.given_bias_std = math.inf
         monitor.given_moved = NEVER
         monitor.given_stamp = given_before
     if monitor.given_stamp == NEVER:
         return
+    bias_variance = 0.0
+    for i in range(GYRO_BIAS, GYRO_BIAS + 3):
+        bias_variance = max(bias_variance, state.covariance[i, i])
+    # A takeover opens the biases, which have not been as uncertain all the time.
+    monitor.given_bias_std = min(monitor.given_bias_std, math.sqrt(bias_variance))
+    drift = monitor.given_bias_std * (state.stamp - monitor.given_stamp) * 1e-9
+    monitor.given_wrong = max(monitor.given_wrong, wrong_by(math.hypot(monitor.given_std, drift)))
     if state.heading.given_stamp > monitor.given_stamp:
         # The course over ground has replaced it.
         monitor.given_stamp = state.heading.given_stamp
@@ -172,7 +185,7 @@ def watch_given_heading(state, given_before, turned):
     monitor.given_off += turned
     monitor.explained[0] = state.trust.takeovers
     monitor.explained[1] = state.receiver.departures[0]
-    if abs(monitor.given_off) > wrong_by(monitor.given_std):
+    if abs(monitor.given_off) > monitor.given_wrong:
         state.installation.information.fill(0.0)
         state.installation.evidence.fill(0.0)
         state.installation.misfit.fill(0.0)
@@ -180,7 +193,7 @@ def watch_given_heading(state, given_before, turned):
 
 @njit
 def wrong_by(std):
-    """Return by how much (rad) a heading given with a standard deviation (rad) must be corrected to be called wrong."""
+    """Return by how much (rad) a heading that is known to a standard deviation (rad) must be corrected to be wrong."""
     return max(WRONG_SIGMAS * std, LEAST_WRONG)
 
 
@@ -224,7 +237,7 @@ def given_heading_complaints(state: np.void) -> list[str]:
     monitor = state["heading_monitor"]
     off, std = abs(float(monitor["given_off"])), math.sqrt(float(state["covariance"][ATTITUDE + 2, ATTITUDE + 2]))
     is_known = state["heading_known"] and WRONG_SIGMAS * std < off
-    if monitor["given_stamp"] == NEVER or off < wrong_by(float(monitor["given_std"])) or not is_known:
+    if monitor["given_stamp"] == NEVER or off < monitor["given_wrong"] or not is_known:
         return []
     return [
         "the heading that was given (alignment.initial_heading_deg, warm start, initialpose) was off by "
