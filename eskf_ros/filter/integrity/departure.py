@@ -36,6 +36,10 @@ HEARD_INTERVAL = 0.15
 LARGEST_LAG = 3.0
 """s; lags up to here are tried, to both sides."""
 
+LONGEST_TOLD = 2.2
+"""s; longer ones are not believed: one near the end of the range may be any, or none that fits. A smooth start from a
+creep that passed for rest looks like one of 3 s."""
+
 LAG_STEP = 0.1
 """s; step between the lags that are tried."""
 
@@ -223,7 +227,8 @@ def update_lag(departure):
                 lag, most, left_most, count_most = side * k * LAG_STEP, none - left, left, count
                 shift = length_by_imu(departure, last, column)
                 shift -= length_by_imu(departure, last - abs(lag), column)
-    if most > SHOWN and left_most < FITS * count_most and shift > LEAST_SHIFT[column]:
+    is_credible = abs(lag) < LONGEST_TOLD and left_most < FITS * count_most
+    if is_credible and most > SHOWN and shift > LEAST_SHIFT[column]:
         departure.lag = lag if abs(lag) > NOTABLE_LAG else 0.0
 
 
