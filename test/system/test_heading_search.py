@@ -14,8 +14,8 @@ from campaign.running import recording_of, run_one
 from eskf_ros.filter.alignment.heading_search import (
     agrees_with_search,
     begin_search,
-    has_moved,
     hide_motion,
+    is_faster_than,
     note_level,
     predict_search,
     turn_found,
@@ -198,18 +198,18 @@ def test_a_search_that_sees_a_drive_or_another_turn_contradicts_a_turn_in_place(
     """As far as it knows: nothing before it has begun, and no velocity right after."""
     variances, turn = (0.01, 0.0, 0.01), 1.0
     search = Search(1, turn)
-    assert not has_moved(search.state, 0.3)
+    assert not is_faster_than(search.state, 0.3)
     assert agrees_with_search(search.state, math.cos(turn + 1.0), math.sin(turn + 1.0), variances)
     search.drive((0.0, 0.0), 10.0)
-    assert not has_moved(search.state, 0.3)
+    assert not is_faster_than(search.state, 0.3)
     search.drive((0.8, 0.3), 4.0)
-    assert has_moved(search.state, 0.3)
-    assert not has_moved(search.state, 5.0)
+    assert is_faster_than(search.state, 0.3)
+    assert not is_faster_than(search.state, 5.0)
     assert agrees_with_search(search.state, math.cos(turn), math.sin(turn), variances)
     assert not agrees_with_search(search.state, math.cos(turn + 1.0), math.sin(turn + 1.0), variances)
     assert not agrees_with_search(search.state, 1.6 * math.cos(turn), 1.6 * math.sin(turn), variances)
     search.state["search"]["started"] = 0
-    assert not has_moved(search.state, 0.3)
+    assert not is_faster_than(search.state, 0.3)
     assert agrees_with_search(search.state, -math.cos(turn), -math.sin(turn), variances)
 
 

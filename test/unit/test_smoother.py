@@ -17,6 +17,7 @@ from eskf_ros.filter.output.forward_log import (
     COVARIANCE_BEFORE,
     FADE,
     NODE,
+    POINT,
     RESET,
     TRANSITION,
     Log,
@@ -34,7 +35,9 @@ from eskf_ros.smooth.backward import (
     smooth_nodes,
 )
 from eskf_ros.smooth.smoother import Smoother
+from eskf_ros.smooth.trajectory import correct_point
 from monte_carlo import NO_REST, feed, messages_of
+from support.kernels import make_state
 from support.reference_filter import mean_rotation
 
 Array = NDArray[np.float64]
@@ -380,3 +383,18 @@ def test_the_order_of_arrival_does_not_matter(drive: Recording) -> None:
     assert smoother.breaks == 0
     for name in ("stamp", "position_map", "attitude_body_to_map", "pose_covariance", "accel_bias"):
         np.testing.assert_array_equal(found[0][name], found[1][name])
+
+
+def test_a_smoothed_velocity_turns_along_the_arc_with_its_heading() -> None:
+    """The correction of a point is injected as those of the filter: 10 m/s, whose heading is 60 degrees off."""
+    state, point = make_state(), allocate(POINT)[0]
+    point["attitude"][0] = 1.0
+    point["velocity_map"][0] = point["position_map"][0] = 10.0
+    correction = np.zeros(2 * ERROR_SIZE)
+    for place in (CORRECTION_AFTER, CORRECTION_BEFORE):
+        correction[place + 8] = np.pi / 3.0
+        correction[place + 4] = correction[place + 1] = 10.0 * np.pi / 3.0
+    correct_point(state, point, correction, correction, 0.5, 0.0)
+    expected = 10.0 * np.array([0.5, np.sqrt(0.75), 0.0])
+    np.testing.assert_allclose(state["velocity_map"], expected, atol=1e-9)
+    np.testing.assert_allclose(state["position_map"], expected, atol=1e-9)

@@ -6,7 +6,14 @@ import math
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.heading_from_turning import turn_from_spot
-from eskf_ros.filter.alignment.heading_search import COSINE, begin_search, spread, turn_found, update_search
+from eskf_ros.filter.alignment.heading_search import (
+    COSINE,
+    begin_search,
+    nis_of_pair,
+    spread,
+    turn_found,
+    update_search,
+)
 from eskf_ros.filter.history.records import XX, YY, ZZ
 from eskf_ros.filter.inertial.covariance import update_error_axes
 from eskf_ros.filter.inertial.navigation_frame import (
@@ -114,7 +121,7 @@ def reset_to_search(state, heading, std, settings):
     xx = p[VELOCITY, VELOCITY] + found[2, 2]
     xy = p[VELOCITY, VELOCITY + 1] + found[2, 3]
     yy = p[VELOCITY + 1, VELOCITY + 1] + found[3, 3]
-    if yy * x * x - 2.0 * xy * x * y + xx * y * y <= SAME_VELOCITY * (xx * yy - xy * xy):
+    if nis_of_pair(x, y, xx, xy, yy) <= SAME_VELOCITY:
         for i in range(2):
             state.velocity_map[i] = state.search.estimate[2 + i]
             for j in range(state.error_size):

@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
-from eskf_ros.filter.alignment.heading_search import LENGTH_TOLERANCE, agrees_with_search, has_moved, nis_of_pair
+from eskf_ros.filter.alignment.heading_search import LENGTH_TOLERANCE, agrees_with_search, is_faster_than, nis_of_pair
 from eskf_ros.filter.inertial.navigation_frame import body_rate
 from eskf_ros.filter.state.error_state import GYRO_BIAS
 from eskf_ros.filter.state.time import NEVER
@@ -120,7 +120,7 @@ def turn_from_spot(state, measured, source, settings, work):
 def is_driving(state, base):
     """Say whether the search sees the IMU, ``base`` (m) from the point that stands, move faster than by the turn."""
     rate = body_rate(state, to_matrix(state.attitude))
-    return has_moved(state, FASTEST_CREEP + math.sqrt(dot(rate, rate) * dot(base, base)))
+    return is_faster_than(state, FASTEST_CREEP + math.sqrt(dot(rate, rate) * dot(base, base)))
 
 
 @njit

@@ -245,7 +245,7 @@ def update_search(state, first, measured, lever, noise, gate, work):
     sen = east[first + 1] + h[1][0] * east[4] + h[1][1] * east[5] + noise[0, 1]
     snn = north[first + 1] + h[1][0] * north[4] + h[1][1] * north[5] + noise[1, 1]
     determinant = see * snn - sen * sen
-    if nis_of_pair(innovation_e, innovation_n, see, sen, snn) > gate:
+    if not determinant > 0.0 or nis_of_pair(innovation_e, innovation_n, see, sen, snn) > gate:
         return
     for i in range(SEARCH_SIZE):
         gain_e = (snn * east[i] - sen * north[i]) / determinant
@@ -272,13 +272,13 @@ def turn_found(state):
 
 
 @njit
-def has_moved(state, slowest):
-    """Say whether the search has a velocity above ``slowest`` (m/s) that is not chance."""
+def is_faster_than(state, speed):
+    """Say whether the search has a velocity above ``speed`` (m/s) that is not chance."""
     if state.search.started == 0:
         return False
     east, north = state.search.estimate[2], state.search.estimate[3]
     p = state.search.covariance
-    is_fast = east * east + north * north > slowest * slowest
+    is_fast = east * east + north * north > speed * speed
     return is_fast and nis_of_pair(east, north, p[2, 2], p[2, 3], p[3, 3]) > CHANCE_GATE
 
 

@@ -25,8 +25,8 @@ from eskf_ros.geodesy.rotation import (
 ITERATIONS = 4
 """Estimates of the errors by one measurement, at most. What is missed becomes less by half of the turn (rad) each."""
 
-SMALL_TURN = 1e-6
-"""rad; a smaller correction of the attitude turns nothing."""
+NEGLIGIBLE = 1e-12
+"""Share of a correction up to which it does not matter that it is missed."""
 
 TURNING_RATE = 0.1
 """rad/s; beyond it the robot turns, whatever the bias of its gyro."""
@@ -95,10 +95,10 @@ def compute_correction(state, size, work):
     """Write the estimate of the errors to ``work.correction``.
 
     Position and velocity are corrected in axes that turn with the attitude meanwhile (`reset_errors`), so that the
-    measurement is not met by as much (``work.missed``). It counts again, until the turn is small: the iterated update
+    measurement is not met by as much (``work.missed``). It counts again, until that is negligible: the iterated update
     of Bell and Cathey (The iterated Kalman filter update as a Gauss-Newton method, 1993), whose gain is kept.
     """
-    c, missed = work.correction, work.missed
+    c, missed, share = work.correction, work.missed, 1.0
     missed.fill(0.0)
     for _ in range(ITERATIONS):
         for i in range(state.error_size):
@@ -114,7 +114,8 @@ def compute_correction(state, size, work):
                 for a in range(size):
                     missed[a] += work.jacobian[a, block + i] * (c[block + i] - turned[i])
                 c[block + i] = turned[i]
-        if dot(turn, turn) < SMALL_TURN**2:
+        share *= 0.5 * math.sqrt(dot(turn, turn))
+        if share < NEGLIGIBLE:
             return
 
 
@@ -167,8 +168,9 @@ def reset_errors(state, correction):
     up = local_up(state)
     angle = dot(up, (correction[ATTITUDE], correction[ATTITUDE + 1], correction[ATTITUDE + 2]))
     turn = to_matrix(from_rotation_vector((angle * up[0], angle * up[1], angle * up[2])))
+    used = state.covariance[: state.error_size, : state.error_size]
     for block in (POSITION, VELOCITY, ATTITUDE):
-        update_error_axes(state.covariance, block, turn)
+        update_error_axes(used, block, turn)
     turn_rows(state.forward.reset, 0, turn)
 
 
