@@ -283,6 +283,7 @@ _NEVER = {
         "moving_stamp",
         "resting_stamp",
         "doubt_stamp",
+        "changed_stamp",
         "quiet_pressure_stamp",
         "wheel_stamp",
         "slip_stamp",

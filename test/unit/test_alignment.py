@@ -23,6 +23,7 @@ from eskf_ros.filter.measurements import gnss_position
 from eskf_ros.filter.state.memory import allocate
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity import static_window
+from eskf_ros.filter.stationarity.detector import add_to_block
 from support.kernels import (
     USUAL_STDS,
     conditioned_eigenvalues,
@@ -587,6 +588,49 @@ def test_a_robot_that_tilts_while_it_stands_has_no_other_gyro_bias(rate_deg: flo
     assert abs(state["gyro_bias"][1] - bias[1]) < 0.5 * pitching
 
 
+def level_in_bend(rates_deg: Any, speed: float | None, step: float = 0.0) -> Any:
+    """Show the stillness watch a yaw rate (deg/s) for a second each; fixes have seen a speed (m/s), or nothing.
+
+    ``step`` (m/s2): the force along y changes by it after the first ten seconds.
+    """
+    settings, state, rng = make_settings(alignment__static_duration=2.0), waiting(), np.random.default_rng(5)
+    if speed is not None:
+        state["seen"]["stamp"][0] = state["stamp"]
+        state["seen"]["velocity"][0, 0] = speed
+        state["seen"]["velocity_variance"][0] = 0.01
+    force, rate = at_rest(state, Rotation.identity(), np.zeros(3), np.zeros(3))
+    for second, yaw_rate in enumerate(rates_deg):
+        for _ in range(round(RATE_HZ)):
+            state["stamp"] += 10_000_000
+            state["specific_force"] = force + (0.0, step * (second >= 10), 0.0) + 0.01 * rng.normal(size=3)
+            state["angular_rate"] = rate + (0.0, 0.0, math.radians(yaw_rate)) + 1e-3 * rng.normal(size=3)
+            update_rest(state, settings)
+            add_to_block(state, settings)
+    return state
+
+
+@pytest.mark.parametrize("first", [0.3, 1.5])
+def test_the_rate_in_a_slow_bend_is_no_gyro_bias(first: float) -> None:
+    """1 m/s through bends, quiet as at rest: the rate changes all the time. At rest it stays."""
+    rates = first + 0.2 * np.sin(0.7 * np.arange(20.0))
+    state = level_in_bend(rates, speed=1.0)
+    assert state["level_known"] == 1
+    assert abs(state["gyro_bias"][2]) < 2.0 * math.sqrt(core(state)[14, 14])
+    at_rest, unseen = level_in_bend(np.full(20, first), speed=0.0), level_in_bend(rates, speed=None)
+    assert at_rest["gyro_bias"][2] == pytest.approx(math.radians(first), abs=3e-4)
+    for known in (at_rest, unseen):
+        assert math.sqrt(core(known)[14, 14]) < 5e-4 < 0.1 * math.sqrt(core(state)[14, 14])
+
+
+@pytest.mark.parametrize("seconds", [12, 20])
+def test_a_change_at_rest_costs_nothing_of_what_is_known_of_the_gyro(seconds: int) -> None:
+    """Somebody steps aboard after ten seconds: the robot may have set out, but what it knew of its gyro holds."""
+    state = level_in_bend(np.full(seconds, 0.4), speed=0.0, step=0.05)
+    assert state["rest"]["changed_stamp"] > NEVER
+    assert state["gyro_bias"][2] == pytest.approx(math.radians(0.4), abs=3e-4)
+    assert core(state)[14, 14] < 1.5 * core(level_in_bend(np.full(10, 0.4), speed=0.0))[14, 14]
+
+
 def test_restart_while_standing_still_counts_from_zero() -> None:
     """The IMU falls silent on a parked robot: afterwards the gyro bias is what it was before, not several times it."""
     settings = make_settings(alignment__static_duration=2.0)
@@ -617,10 +661,11 @@ def test_restart_under_way_does_not_know_the_heading_of_the_start() -> None:
     assert state["heading_known"] == 0 or core(state)[8, 8] > 0.5
 
 
-def distrusting(robots: int, std: float, speed: float = 0.0) -> int:
+def distrusting(robots: int, std: float, speed: float = 0.0, wild: Any = ()) -> int:
     """Return how many robots, level and waiting for a heading, lose their level to 20 s of fixes at 5 Hz.
 
-    Fixes scatter by ``std`` (m) on each axis and move at ``speed`` (m/s); a still window has just passed every 2 s.
+    Fixes scatter by ``std`` (m) on each axis and move at ``speed`` (m/s); a still window has just passed every 2 s. The
+    fixes ``wild`` are 2 km off.
     """
     rng = np.random.default_rng(7)
     settings = make_settings()
@@ -632,7 +677,8 @@ def distrusting(robots: int, std: float, speed: float = 0.0) -> int:
         for epoch in range(100):
             seconds = 0.2 * epoch
             east, north, up = std * rng.normal(size=3)
-            latitude = math.radians(DATUM[0]) + (north + speed * seconds) / 6.378e6
+            north += speed * seconds + 2000.0 * (epoch in wild)
+            latitude = math.radians(DATUM[0]) + north / 6.378e6
             longitude = math.radians(DATUM[1]) + east / (6.378e6 * math.cos(latitude))
             aid["stamp"] = round(seconds * 1e9)
             aid["payload"][:9] = (latitude, longitude, DATUM[2] + up, std**2, 0.0, 0.0, std**2, 0.0, std**2)
@@ -658,6 +704,12 @@ def test_the_scatter_of_fixes_takes_no_level_away(std: float) -> None:
 def test_fixes_that_move_take_a_false_level_away(std: float, speed: float) -> None:
     """No robot can have stood still within the last 2 s: what felt like rest was an even drive."""
     assert distrusting(20, std, speed) == 20
+
+
+@pytest.mark.parametrize("wild", [(54,), (59,), (60,), (61,)])
+def test_one_wild_fix_takes_no_level_away(wild: tuple[int, ...]) -> None:
+    """Nor is it what the next ones are compared with, wherever in a window of ten it comes."""
+    assert distrusting(5, 1.0, wild=wild) == 0
 
 
 def test_first_fix_starts_the_position() -> None:

@@ -321,8 +321,8 @@ def update_gyro_bias_at_rest(state, prior_bias, prior, mean_rate, turn_variance,
         known = (earth[0], earth[1], earth[2])
         horizontal_variance = noise + horizontal_square * settings.initial_heading_std**2
     horizontal_variance += turn_variance
-    # A turn that a dual antenna does not exclude may be what the gyro reads.
-    vertical_variance += unseen_turn(state)
+    # A turn that nothing excludes may be what the gyro reads.
+    vertical_variance += unseen_turn(state, state.window.still_changed == 1)
     vertical_gain = prior / (prior + vertical_variance) if is_rest and prior > 0.0 else 0.0
     horizontal_gain = prior / (prior + horizontal_variance) if is_rest and prior > 0.0 else 0.0
     mean_map = rotate(

@@ -31,6 +31,7 @@ from eskf_ros.filter.stationarity.quiet_run import (
     LEAST_CHANGE,
     add_to_run,
     has_changed,
+    is_complete,
     variance_of_mean,
 )
 from eskf_ros.filter.stationarity.seen_motion import (
@@ -42,7 +43,7 @@ from eskf_ros.filter.stationarity.seen_motion import (
     see_velocity,
     see_yaw,
 )
-from eskf_ros.filter.stationarity.static_window import update_motion
+from eskf_ros.filter.stationarity.static_window import MEASURED_SPEED, update_motion
 from eskf_ros.geodesy.earth import geodetic_to_ecef
 from eskf_ros.geodesy.rotation import dot, rotate_back, to_matrix
 
@@ -61,6 +62,7 @@ REST = np.dtype(
         ("moving_stamp", "i8"),
         ("resting_stamp", "i8"),
         ("doubt_stamp", "i8"),
+        ("changed_stamp", "i8"),
         ("moving_activity", "f8"),
         ("resting_activity", "f8"),
         ("quiet", "i8"),
@@ -80,14 +82,12 @@ REST = np.dtype(
   variance of the means of single blocks about it.
 - ``moving_stamp``, ``resting_stamp``: when another sensor last saw motion and rest (ns).
 - ``doubt_stamp``: when the dual antenna could last not exclude a turn (ns).
+- ``changed_stamp``: the end of the last quiet block whose mean readings were not those before it (ns).
 - ``moving_activity``, ``resting_activity``: learnt activity of the IMU (see `unrest`) in motion and at rest.
 - ``quiet``: whether the IMU was quiet in the last block.
 - ``quiet_pressure*``: pressure at the time when the IMU became quiet.
 - ``wheel_stamp``, ``slip_stamp``: the last message of the wheels, and the last one that the gate rejected (ns).
 """
-
-FEWEST_SAMPLES = 3
-"""Samples, at least, in each half of a block: fewer do not show the spread."""
 
 STEADY_SIGMAS = 4.0
 """Standard deviations by which the means of the two halves of a block may differ at rest."""
@@ -161,13 +161,6 @@ def add_to_block(state, settings):
         state.rest.block_square_sum[i] += force * force
         state.rest.block_sum[3 + i] += rate
         state.rest.block_square_sum[3 + i] += rate * rate
-
-
-@njit
-def is_complete(state):
-    """Say whether both halves of the block have enough samples and no gap is among them."""
-    count = state.rest.block_half_count
-    return state.rest.block_broken == 0 and count >= FEWEST_SAMPLES and state.rest.block_count - count >= FEWEST_SAMPLES
 
 
 @njit
@@ -326,14 +319,15 @@ def update_rest_evidence(state, aid):
             note_seen(state, aid.stamp, see_velocity(state, BODY_EYE, aid.stamp, velocity, (p[XX], p[YY], p[ZZ])))
         elif speed > max(MOTION_SIGMAS * std, LEAST_MOTION):
             state.rest.moving_stamp = aid.stamp
-        return update_motion(state, speed - MOTION_SIGMAS * std, aid.stamp, aid.stamp)
+        return update_motion(state, speed - MOTION_SIGMAS * std, aid.stamp, aid.stamp, MEASURED_SPEED)
     elif aid.stream == Stream.WHEEL:
         if abs(p[0]) < STANDING_SPEED and abs(p[1]) < STANDING_YAW_RATE:
             if p[XX] > 0.0:
                 state.rest.resting_stamp = aid.stamp
         else:
             state.rest.moving_stamp = aid.stamp
-            return update_motion(state, abs(p[0]) - MOTION_SIGMAS * math.sqrt(max(p[XX], 0.0)), aid.stamp, aid.stamp)
+            speed = abs(p[0]) - MOTION_SIGMAS * math.sqrt(max(p[XX], 0.0))
+            return update_motion(state, speed, aid.stamp, aid.stamp, MEASURED_SPEED)
     elif aid.stream == Stream.BARO:
         note_pressure(state, aid)
     return False

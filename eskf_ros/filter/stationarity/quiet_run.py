@@ -7,6 +7,10 @@ felt a second later, seconds to minutes before other sensors have seen it.
 from __future__ import annotations
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.state.time import NEVER
+
+FEWEST_SAMPLES = 3
+"""Samples, at least, in each half of a block: fewer do not show the spread."""
 
 CHANGE_SIGMAS = 4.0
 """Standard deviations by which the mean of a quiet block must differ from those before it to show a start or a stop."""
@@ -17,8 +21,18 @@ LEAST_CHANGE = (5e-3, 2e-4)
 FEWEST_BLOCKS = 3
 """Quiet blocks, at least, that tell how much their means scatter."""
 
+CHANGE_LASTS = 3_000_000_000
+"""ns; a change of the readings counts for this long: those of a robot that moves, however slowly, change again."""
+
 RUN_MEMORY = 10
 """Blocks over which their mean and its scatter are taken."""
+
+
+@njit
+def is_complete(state):
+    """Say whether both halves of the block have enough samples and no gap is among them."""
+    count = state.rest.block_half_count
+    return state.rest.block_broken == 0 and count >= FEWEST_SAMPLES and state.rest.block_count - count >= FEWEST_SAMPLES
 
 
 @njit
@@ -48,12 +62,21 @@ def has_changed(state):
 
 
 @njit
+def has_changed_lately(state):
+    """Say whether the mean readings of a quiet IMU change: between the last blocks, or in the one being filled."""
+    if state.rest.changed_stamp != NEVER and state.stamp - state.rest.changed_stamp <= CHANGE_LASTS:
+        return True
+    return is_complete(state) and has_changed(state)
+
+
+@njit
 def add_to_run(state, is_quiet):
     """Add the block to the run of quiet blocks; one that is loud, or changed, begins another."""
     if not is_quiet:
         state.rest.run_blocks = 0
         return
     if has_changed(state):
+        state.rest.changed_stamp = state.rest.block_end
         state.rest.run_blocks = 0
     state.rest.run_blocks += 1
     share = 1.0 / min(state.rest.run_blocks, RUN_MEMORY)

@@ -109,6 +109,9 @@ LOUD_TURN_CHANGE = 1.0
 SLOWEST_TURN = 1.75e-3
 """rad/s (0.1 deg/s); a turn this fast must be excluded before a dual antenna sees rest."""
 
+TURN_RADIUS = 20.0
+"""m; of the bends of a robot that drives so slowly and evenly that its IMU is as quiet as at rest."""
+
 NO_ALTITUDE_VARIANCE = 1e6
 """m2 or m2/s2; an axis with a larger variance was not measured."""
 
@@ -251,12 +254,21 @@ def see_yaw(state, stamp, yaw, variance):
 
 
 @njit
-def unseen_turn(state):
-    """Return the mean square ((rad/s)2) of a turn that a dual antenna does not exclude; 0 where there is none."""
+def unseen_turn(state, has_changed):
+    """Return the mean square ((rad/s)2) of a turn that the sensors do not exclude while the IMU is as quiet as at rest.
+
+    It is that which a dual antenna leaves. Without one a robot turns only where its readings change (``has_changed``),
+    with the speed that its sensors do not exclude. It is 0 where none of them has spoken: robots start at rest.
+    """
     last = state.seen.turn_stamp
-    if last == NEVER or state.stamp - last > LONGEST_TURN:
-        return 0.0
-    return state.seen.turn_rate**2 + state.seen.turn_rate_variance
+    if last != NEVER and state.stamp - last <= LONGEST_TURN:
+        return state.seen.turn_rate**2 + state.seen.turn_rate_variance
+    square = math.inf
+    for eye in range(EYES):
+        if has_changed and state.seen.stamp[eye] != NEVER:
+            v, p = state.seen.velocity[eye], state.seen.velocity_variance[eye]
+            square = min(square, v[0] ** 2 + v[1] ** 2 + p[0] + p[1])
+    return square / TURN_RADIUS**2 if square < math.inf else 0.0
 
 
 @njit

@@ -13,6 +13,7 @@ from eskf_ros.filter.inertial.navigation_frame import local_up
 from eskf_ros.filter.inertial.sample_quality import is_hidden
 from eskf_ros.filter.state.error_state import GYRO_BIAS, SOURCES
 from eskf_ros.filter.state.time import NEVER
+from eskf_ros.filter.stationarity.quiet_run import has_changed_lately
 from eskf_ros.filter.stationarity.residual_motion import MOVING_SPEED
 from eskf_ros.geodesy.earth import STANDARD_GRAVITY, geodetic_to_ecef
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix
@@ -31,7 +32,9 @@ STATIC_WINDOW = np.dtype(
         ("still_start", "i8"),
         ("still_force", "f8", (3,)),
         ("still_speed", "f8"),
+        ("still_changed", "i8"),
         ("motion_stamp", "i8"),
+        ("disproofs", "i8", (SOURCES + 1,)),
         ("last_fix_stamp", "i8", (SOURCES,)),
         ("last_fix_ecef", "f8", (SOURCES, 3)),
         ("last_fix_variance", "f8", (SOURCES,)),
@@ -47,8 +50,10 @@ sensors.
   ``half_samples``, ``half_force``: samples in its first half, and their force (m/s2).
 - ``still_stamp``, ``still_samples``, ``still_total``: the end of the last still window (ns), samples and sums of the
   run. ``still_start``, ``still_force``: the start of its first window (ns), and the mean force (m/s2) in the first half
-  of that. ``still_speed``: how fast the robot may have been then (m/s).
+  of that. ``still_speed``: how fast the robot may have been then (m/s). ``still_changed``: whether the mean readings
+  change within the windows, as those of a robot that moves slowly do, or stay: a run is the one or the other.
 - ``motion_stamp``: when another sensor last proved motion (ns).
+- ``disproofs``: how many speeds in a row disprove the last level, from the fixes of each receiver and measured ones.
 - ``last_fix_*``: the last fix by receiver, because their antennas are apart: stamp (ns), ECEF (m), variance (m2).
 - ``anchor_*``: the fix by receiver from which the window started.
 """
@@ -73,6 +78,12 @@ REST_RATE_SIGMAS = 4.0
 
 STRONGEST_START = 5.0
 """m/s2; no robot gathers speed faster."""
+
+MEASURED_SPEED = SOURCES
+"""Index in ``disproofs`` of speeds that a sensor measures. Those before it come from the fixes of a receiver."""
+
+LEAST_DISPROOFS = 2
+"""Speeds in a row that disprove a level. One may be a wild fix."""
 
 MINIMUM_WINDOW_SAMPLES = 10
 """Samples, at least, of a full window."""
@@ -138,7 +149,10 @@ def update_static_window(state, settings):
     if window != Window.REST:
         state.window.still_samples = 0
     else:
-        if state.window.still_samples == 0:
+        changed = 1 if has_changed_lately(state) else 0
+        if state.window.still_samples == 0 or changed != state.window.still_changed:
+            state.window.still_samples = 0
+            state.window.still_changed = changed
             for i in range(6):
                 state.window.still_total[i] = 0.0
             state.window.still_start = state.window.start
@@ -169,7 +183,8 @@ def update_evidence_from_fix(state, aid):
 def update_evidence_from_place(state, ecef, std, stamp, source):
     """Keep the position (m, ECEF) of an antenna, and compare it with the anchor; return whether the level is disproved.
 
-    ``std`` (m) is the largest standard deviation of the axes. See `update_motion` for what is returned.
+    ``std`` (m) is the largest standard deviation of the axes. See `update_motion` for what is returned. A place that
+    may be wild is no anchor for the next ones.
     """
     is_disproved = False
     if NEVER < state.window.anchor_stamp[source] < stamp:
@@ -177,7 +192,9 @@ def update_evidence_from_place(state, ecef, std, stamp, source):
         step = (ecef[0] - a[0], ecef[1] - a[1], ecef[2] - a[2])
         seconds = (stamp - state.window.anchor_stamp[source]) * 1e-9
         speed = (math.sqrt(dot(step, step)) - POSITION_SIGMAS * math.sqrt(2.0) * std) / seconds
-        is_disproved = update_motion(state, speed, state.window.anchor_stamp[source], stamp)
+        is_disproved = update_motion(state, speed, state.window.anchor_stamp[source], stamp, source)
+        if 0 < state.window.disproofs[source] < LEAST_DISPROOFS:
+            return False
     state.window.last_fix_stamp[source] = stamp
     for i in range(3):
         state.window.last_fix_ecef[source, i] = ecef[i]
@@ -189,22 +206,27 @@ def update_evidence_from_velocity(state, aid):
     """Look for motion in a GNSS velocity; return whether the last level is disproved (`update_motion`)."""
     speed = math.sqrt(aid.payload[0] ** 2 + aid.payload[1] ** 2 + aid.payload[2] ** 2)
     std = math.sqrt(max(aid.payload[XX], aid.payload[YY], aid.payload[ZZ]))
-    return update_motion(state, speed - VELOCITY_SIGMAS * std, aid.stamp, aid.stamp)
+    return update_motion(state, speed - VELOCITY_SIGMAS * std, aid.stamp, aid.stamp, MEASURED_SPEED)
 
 
 @njit
-def update_motion(state, speed, since, stamp):
+def update_motion(state, speed, since, stamp, evidence):
     """Take a speed (m/s), its uncertainty subtracted, as proof of motion; return whether it disproves the last level.
 
     The speed is the mean from ``since`` to ``stamp`` (ns). The level is disproved if no robot can have gathered that
-    speed since the last still window: then that window was not at rest.
+    speed since the last still window: then that window was not at rest. The speed before it of the same ``evidence``
+    (index in ``disproofs``) must say so, too.
     """
-    if speed <= MOVING_SPEED:
-        return False
-    state.window.motion_stamp = stamp
-    state.rest.moving_stamp = stamp
-    waiting = state.heading_known == 0 and state.level_known == 1 and state.window.still_stamp != NEVER
-    return waiting and speed > MOVING_SPEED + STRONGEST_START * (stamp - min(since, state.window.still_stamp)) * 1e-9
+    w = state.window
+    fastest = MOVING_SPEED
+    if w.still_stamp != NEVER:
+        fastest += STRONGEST_START * (stamp - min(since, w.still_stamp)) * 1e-9
+    is_waiting = state.heading_known == 0 and state.level_known == 1 and w.still_stamp != NEVER
+    w.disproofs[evidence] = w.disproofs[evidence] + 1 if is_waiting and speed > fastest else 0
+    if speed > MOVING_SPEED:
+        w.motion_stamp = stamp
+        state.rest.moving_stamp = stamp
+    return w.disproofs[evidence] >= LEAST_DISPROOFS
 
 
 @njit

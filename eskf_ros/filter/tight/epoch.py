@@ -38,6 +38,7 @@ from eskf_ros.filter.state.lanes import FILTER, HUMBLE, is_judging
 from eskf_ros.filter.stationarity.detector import note_seen
 from eskf_ros.filter.stationarity.seen_motion import see_velocity
 from eskf_ros.filter.stationarity.static_window import (
+    MEASURED_SPEED,
     VELOCITY_SIGMAS,
     update_evidence_from_place,
     update_motion,
@@ -234,7 +235,7 @@ def note_solution(state, stamp, which, settings, work):
             reset_level_to_moving(state, settings)
     else:
         speed = math.sqrt(dot(measured, measured))
-        if update_motion(state, speed - VELOCITY_SIGMAS * std, stamp, stamp):
+        if update_motion(state, speed - VELOCITY_SIGMAS * std, stamp, stamp, MEASURED_SPEED):
             reset_level_to_moving(state, settings)
         variances = (work.normal[0, 0], work.normal[1, 1], work.normal[2, 2])
         note_seen(state, stamp, see_velocity(state, 0, stamp, measured, variances))

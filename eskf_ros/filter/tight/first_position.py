@@ -10,7 +10,12 @@ from eskf_ros.filter.alignment.heading import reset_heading_from_memory
 from eskf_ros.filter.alignment.levelling import reset_level_to_moving
 from eskf_ros.filter.state.enums import Verdict
 from eskf_ros.filter.state.time import NEVER
-from eskf_ros.filter.stationarity.static_window import VELOCITY_SIGMAS, update_evidence_from_place, update_motion
+from eskf_ros.filter.stationarity.static_window import (
+    MEASURED_SPEED,
+    VELOCITY_SIGMAS,
+    update_evidence_from_place,
+    update_motion,
+)
 from eskf_ros.filter.tight.epoch_least_squares import LARGEST_EPOCH, gather, solve_epoch, spread_of
 from eskf_ros.filter.tight.receiver_clock import join_offsets, reset_or_jump_clock
 from eskf_ros.filter.tight.signal import MEASURED, SATELLITE, antenna_ecef, see
@@ -109,7 +114,7 @@ def note_coarsely(state, aids, first, end, which, settings, work):
         if solve_epoch(work):
             step = (work.step[0], work.step[1], work.step[2])
             std = math.sqrt(max(work.normal[0, 0], work.normal[1, 1], work.normal[2, 2]))
-            if update_motion(state, math.sqrt(dot(step, step)) - VELOCITY_SIGMAS * std, stamp, stamp):
+            if update_motion(state, math.sqrt(dot(step, step)) - VELOCITY_SIGMAS * std, stamp, stamp, MEASURED_SPEED):
                 reset_level_to_moving(state, settings)
 
 
