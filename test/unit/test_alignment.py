@@ -622,7 +622,14 @@ def test_the_rate_in_a_slow_bend_is_no_gyro_bias(first: float) -> None:
         assert math.sqrt(core(known)[14, 14]) < 5e-4 < 0.1 * math.sqrt(core(state)[14, 14])
 
 
-@pytest.mark.parametrize("seconds", [12, 20])
+def test_a_gentle_start_is_no_change_of_the_gyro_bias() -> None:
+    """After four seconds at rest a bend of 0.2 deg/s is within what is not known of the bias."""
+    rates = np.concatenate([np.zeros(4), 0.2 + 0.1 * np.sin(1.5 * np.arange(26.0))])
+    state = level_in_bend(rates, speed=1.0)
+    assert abs(state["gyro_bias"][2]) < 3.0 * math.sqrt(core(state)[14, 14])
+
+
+@pytest.mark.parametrize("seconds", [13, 20])
 def test_a_change_at_rest_costs_nothing_of_what_is_known_of_the_gyro(seconds: int) -> None:
     """Somebody steps aboard after ten seconds: the robot may have set out, but what it knew of its gyro holds."""
     state = level_in_bend(np.full(seconds, 0.4), speed=0.0, step=0.05)
