@@ -61,7 +61,7 @@ def record_drive(path: Path) -> None:
     from eskf_ros.geodesy.map_frame import MapFrame
     from eskf_ros.simulate.scenario import simulate
 
-    drive = simulate("drive", seed=4, imu_rate=50.0, start=15.0, stop=55.0, grade="consumer")
+    drive = simulate("drive", seed=4, imu_rate=25.0, start=15.0, stop=55.0, grade="consumer")
     has_gnss = (drive.fix_stamp - drive.imu_stamp[0]) * 1e-9 < GNSS_ENDS
     chosen = slice(0, None, len(drive.truth_stamp) // 200)
     distance = np.linalg.norm(BEACON_MAP - drive.truth_position_map[chosen], axis=1)

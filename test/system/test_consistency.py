@@ -237,18 +237,18 @@ def test_a_gain_frozen_after_convergence_is_worse_through_a_tunnel_and_after_it(
     errors: dict[float, list[tuple[np.ndarray, np.ndarray]]] = {}
     for seed in range(8):
         # Without latency the two see the same: the opponent works in the order of stamps.
-        recording = simulate("drive", seed, imu_rate=100.0, outages=(tunnel,), latency=(0.0, 0.0))
+        recording = simulate("drive", seed, imu_rate=50.0, outages=(tunnel,), latency=(0.0, 0.0))
         parameters = from_mapping({**recording.parameters(), **NO_SIDE_SLIP, **NO_REST})
         estimator = Navigator(parameters)
         frozen = None
-        stops = np.arange(round(frozen_at * 100) - 1, len(recording.imu_stamp), 500)
+        stops = np.arange(round(frozen_at * 50) - 1, len(recording.imu_stamp), 250)
         for i, state in feed(recording, estimator, stops):
             if frozen is None:
                 frozen = FrozenGain(recording, estimator.state[0], parameters)
             frozen.run_to(int(recording.imu_stamp[i]))
             truth = int(np.searchsorted(recording.truth_stamp, recording.imu_stamp[i]))
             pair = (state_error(recording, i, truth, state), state_error(recording, i, truth, frozen.state))
-            errors.setdefault((i + 1) / 100, []).append(pair)
+            errors.setdefault((i + 1) / 50, []).append(pair)
 
     def ratio(first: float, last: float, block: slice) -> float:
         """Root mean square error from ``first`` to ``last`` s: frozen over full."""

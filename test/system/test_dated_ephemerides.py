@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -92,6 +92,7 @@ def issue(number: int, half: int) -> np.void:
     return record
 
 
+@settings(max_examples=30)
 @given(st.integers(0, 2**32))
 def test_what_has_ended_is_forgotten_unnoticed(seed: int) -> None:
     """Each epoch of a day locates its signals as without forgetting, late by anything within the window."""

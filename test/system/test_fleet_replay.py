@@ -170,12 +170,12 @@ def test_killed_workers_lose_nothing(running: tuple[subprocess.Popen[str], Path]
 def test_memory_does_not_grow_with_the_number_of_recordings(tmp_path: Path) -> None:
     folder = tmp_path / "fleet"
     folder.mkdir()
-    for number in range(24):
+    for number in range(16):
         (folder / f"{number:02d}.mcap").symlink_to(BAG)
     assert main([str(folder), *OPTIONS, "--jobs", "1"]) == 0
     peaks = sorted(entry["peak_mb"] for entry in fleet_of(folder)["recordings"])
-    # The process keeps its peak: what the tenth recording needed is all that the last needs, to a twentieth.
-    assert peaks[-1] < 1.05 * peaks[10]
+    # The process keeps its peak: what the sixth recording needed is all that the last needs, to a thirtieth.
+    assert peaks[-1] < 1.03 * peaks[5]
 
 
 @pytest.fixture(scope="module")
