@@ -27,6 +27,7 @@ RESIDUAL_MOTION = np.dtype(
         ("parts", "i8"),
         ("part_mean_sum", "f8", (6,)),
         ("part_square_sum", "f8", (6,)),
+        ("part_moment_sum", "f8", (3,)),
         ("force_variance", "f8"),
         ("rate_variance", "f8"),
     ],
@@ -37,6 +38,7 @@ RESIDUAL_MOTION = np.dtype(
 - ``moved_first``, ``first_speed``: whether the robot moved when the window began, and how fast it may have (m/s).
 - ``part_start``, ``part_count``, ``part_sum``: start (ns), samples and sums (m/s2, rad/s) of the part being filled.
 - ``parts``, ``part_mean_sum``, ``part_square_sum``: number of full parts, sums of their means and of the squares.
+  ``part_moment_sum``: of the force, the sum of each mean times the number of parts before it (m/s2).
 - ``force_variance``, ``rate_variance``: largest variance of the means in the present run of still windows ((m/s2)2,
   (rad/s)2).
 """
@@ -73,6 +75,8 @@ def add_to_part(state):
         state.residual.part_start = state.stamp
         state.residual.part_count = 0
         state.residual.parts = 0
+        for i in range(3):
+            state.residual.part_moment_sum[i] = 0.0
         for i in range(6):
             state.residual.part_sum[i] = 0.0
             state.residual.part_mean_sum[i] = 0.0
@@ -87,6 +91,8 @@ def add_to_part(state):
         mean = state.residual.part_sum[i] / state.residual.part_count
         state.residual.part_mean_sum[i] += mean
         state.residual.part_square_sum[i] += mean * mean
+        if i < 3:
+            state.residual.part_moment_sum[i] += state.residual.parts * mean
         state.residual.part_sum[i] = 0.0
     state.residual.parts += 1
     state.residual.part_count = 0
@@ -139,13 +145,21 @@ def sway_variance(state, first, noise_density):
 
 @njit
 def variance_of_half(state):
-    """Return the variance ((m/s2)2) of the mean force of half a window, by how its parts scatter: noise, sway, turns.
+    """Return the variance ((m/s2)2) of the mean force of half a window, by how its parts scatter: noise and sway.
 
-    A few parts show it to a factor of two, which is in it; 0 for less than `FEWEST_PARTS`, which do not show it.
+    They scatter about a line, which is that of gravity if the body turns evenly. A few parts show the scatter to a
+    factor of two, which is in it; 0 for less than `FEWEST_PARTS`, which do not show it.
     """
-    if state.residual.parts < FEWEST_PARTS:
+    n = state.residual.parts
+    if n < FEWEST_PARTS:
         return 0.0
-    return 2.0 * sway_variance(state, 0, 0.0) / (0.5 * state.residual.parts)
+    largest = 0.0
+    for i in range(3):
+        mean = state.residual.part_mean_sum[i] / n
+        moment = state.residual.part_moment_sum[i] - 0.5 * (n - 1) * n * mean
+        scatter = state.residual.part_square_sum[i] - n * mean * mean - 12.0 * moment * moment / (n * (n * n - 1.0))
+        largest = max(largest, scatter / (n - 2))
+    return 2.0 * largest / (0.5 * n)
 
 
 @njit
