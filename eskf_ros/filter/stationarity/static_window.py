@@ -218,11 +218,9 @@ def update_motion(state, speed, since, stamp, evidence):
     (index in ``disproofs``) must say so, too.
     """
     w = state.window
-    fastest = MOVING_SPEED
-    if w.still_stamp != NEVER:
-        fastest += STRONGEST_START * (stamp - min(since, w.still_stamp)) * 1e-9
-    is_waiting = state.heading_known == 0 and state.level_known == 1 and w.still_stamp != NEVER
-    w.disproofs[evidence] = w.disproofs[evidence] + 1 if is_waiting and speed > fastest else 0
+    gathered = STRONGEST_START * (stamp - min(since, w.still_stamp)) * 1e-9
+    is_waiting = state.heading_known == 0 and state.level_known == 1
+    w.disproofs[evidence] = w.disproofs[evidence] + 1 if is_waiting and speed > MOVING_SPEED + gathered else 0
     if speed > MOVING_SPEED:
         w.motion_stamp = stamp
         state.rest.moving_stamp = stamp
