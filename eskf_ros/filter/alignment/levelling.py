@@ -78,13 +78,18 @@ def level(state, sums, count, interval, is_rest, settings):
         note_sway(state, is_first, settings)
         braking = state.window.still_speed / duration
         change, variance = change_of_gravity(state, settings)
-        force, rate = without_turn(force, rate, change, duration)
+        is_turning = dot(change, change) > 0.0
+        if is_turning:
+            end = force_of_last_half(state)
+            force = (end[0] - accel_bias[0], end[1] - accel_bias[1], end[2] - accel_bias[2])
+            strength = math.sqrt(dot(force, force))
+            rate = without_turn(force, rate, change)
         # Readings that are those remembered from where the robot was left are not those of a robot that tilts.
         is_remembered = accel_variance < settings.accel_bias_std**2
         turn_variance = 0.0 if is_remembered else variance / strength**2
         tilt_noise = tilt_noise_at_rest(state, duration, strength, braking, settings)
-        if dot(change, change) > 0.0:
-            tilt_noise += (0.5 * duration) ** 2 * turn_variance
+        if is_turning:
+            tilt_noise += variance_of_half(state) / strength**2
         if is_level_better_known(state, accel_variance / strength**2 + tilt_noise, braking):
             return
         state.levelling.unseen_braking = braking
@@ -164,35 +169,34 @@ def change_of_gravity(state, settings):
     window, variance = state.window, variance_of_half(state)
     if variance == 0.0:
         return (0.0, 0.0, 0.0), 0.0
-    n = window.samples - window.half_samples
     passed = (state.stamp - window.still_start) * 1e-9 - 0.5 * settings.static_duration
     variance *= 2.0 / passed**2
     if variance > LARGEST_CHANGE_STD**2:
         return (0.0, 0.0, 0.0), 0.0
-    change = (
-        ((window.total[0] - window.half_force[0]) / n - window.still_force[0]) / passed,
-        ((window.total[1] - window.half_force[1]) / n - window.still_force[1]) / passed,
-        ((window.total[2] - window.half_force[2]) / n - window.still_force[2]) / passed,
-    )
+    end, start = force_of_last_half(state), window.still_force
+    change = ((end[0] - start[0]) / passed, (end[1] - start[1]) / passed, (end[2] - start[2]) / passed)
     if dot(change, change) > TURN_SIGMAS**2 * (variance + LEAST_TURN**2):
         return change, variance
     return (0.0, 0.0, 0.0), variance
 
 
 @njit
-def without_turn(force, rate, change, duration):
-    """Return the force at the end of a run of still windows, and the mean rate without the turn that gravity shows.
+def force_of_last_half(state):
+    """Return the mean force (m/s2, IMU axes) in the second half of the window: gravity at the end of a turn."""
+    window = state.window
+    n, total, half = window.samples - window.half_samples, window.total, window.half_force
+    return ((total[0] - half[0]) / n, (total[1] - half[1]) / n, (total[2] - half[2]) / n)
 
-    ``force``, ``rate``: means over ``duration`` (s); ``change``: of the force (m/s2 per second). Gravity that turns in
-    the body by w x f comes from the rate w = change x f / f^2.
+
+@njit
+def without_turn(force, rate, change):
+    """Return the mean rate (rad/s) in a run of still windows without the turn that gravity shows.
+
+    ``change``: of the force (m/s2 per second). Gravity that turns in the body by w x f comes from the rate
+    w = change x f / f^2.
     """
-    turn = cross(change, force)
-    square = dot(force, force)
-    half = 0.5 * duration
-    return (
-        (force[0] + half * change[0], force[1] + half * change[1], force[2] + half * change[2]),
-        (rate[0] - turn[0] / square, rate[1] - turn[1] / square, rate[2] - turn[2] / square),
-    )
+    turn, square = cross(change, force), dot(force, force)
+    return (rate[0] - turn[0] / square, rate[1] - turn[1] / square, rate[2] - turn[2] / square)
 
 
 @njit
