@@ -593,6 +593,23 @@ def test_a_robot_that_tilts_while_it_stands_has_no_other_gyro_bias(
     assert abs(state["gyro_bias"][1] - bias[1]) < 0.5 * pitching
 
 
+def test_a_robot_that_tilts_unevenly_is_levelled_where_it_is_at_the_end() -> None:
+    """It pitches by two degrees and part of the way back within 40 s. Since the last window it has gone 0.2 deg on."""
+    settings, state, rng = make_settings(alignment__static_duration=2.0), waiting(), np.random.default_rng(4)
+    attitude = Rotation.identity()
+    for k in range(round(40.0 * RATE_HZ)):
+        phase = 0.75 * math.pi * k / (40.0 * RATE_HZ)
+        attitude = Rotation.from_euler("y", 2.0 * math.sin(phase), degrees=True)
+        pitching = math.radians(2.0) * math.cos(phase) * 0.75 * math.pi / 40.0
+        force, rate = at_rest(state, attitude, np.zeros(3), np.zeros(3))
+        state["stamp"] += 10_000_000
+        state["specific_force"] = force + 0.01 * rng.normal(size=3)
+        state["angular_rate"] = rate + (0.0, pitching, 0.0) + 1e-3 * rng.normal(size=3)
+        update_rest(state, settings)
+    assert np.degrees(np.abs(tilt_error(state, attitude))).max() < 0.25
+    assert np.abs(state["gyro_bias"]).max() < 3e-4
+
+
 def level_in_bend(rates_deg: Any, speed: float | None, step: float = 0.0) -> Any:
     """Show the stillness watch a yaw rate (deg/s) for a second each; fixes have seen a speed (m/s), or nothing.
 
