@@ -651,10 +651,11 @@ def test_a_gentle_start_is_no_change_of_the_gyro_bias() -> None:
     assert abs(state["gyro_bias"][2]) < 3.0 * math.sqrt(core(state)[14, 14])
 
 
-@pytest.mark.parametrize("seconds", [13, 20])
-def test_a_change_at_rest_costs_nothing_of_what_is_known_of_the_gyro(seconds: int) -> None:
-    """Somebody steps aboard after ten seconds: the robot may have set out, but what it knew of its gyro holds."""
-    state = level_in_bend(np.full(seconds, 0.4), speed=0.0, step=0.05)
+def test_a_change_at_rest_is_soon_forgotten() -> None:
+    """Somebody steps aboard after ten seconds: the robot may have set out, which the next seconds do not bear out."""
+    doubtful = level_in_bend(np.full(13, 0.4), speed=0.0, step=0.05)
+    assert core(doubtful)[14, 14] > 1e-5
+    state = level_in_bend(np.full(20, 0.4), speed=0.0, step=0.05)
     assert state["rest"]["changed_stamp"] > NEVER
     assert state["gyro_bias"][2] == pytest.approx(math.radians(0.4), abs=3e-4)
     assert core(state)[14, 14] < 1.5 * core(level_in_bend(np.full(10, 0.4), speed=0.0))[14, 14]

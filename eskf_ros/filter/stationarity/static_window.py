@@ -51,7 +51,7 @@ sensors.
 - ``still_stamp``, ``still_samples``, ``still_total``: the end of the last still window (ns), samples and sums of the
   run. ``still_start``, ``still_force``: the start of its first window (ns), and the mean force (m/s2) in the first half
   of that. ``still_speed``: how fast the robot may have been then (m/s). ``still_changed``: whether the mean readings
-  change within the windows, as those of a robot that moves slowly do, or stay: a run is the one or the other.
+  have changed in the last seconds, as those of a robot that moves slowly do.
 - ``motion_stamp``: when another sensor last proved motion (ns).
 - ``disproofs``: how many speeds in a row disprove the last level, from the fixes of each receiver and measured ones.
 - ``last_fix_*``: the last fix by receiver, because their antennas are apart: stamp (ns), ECEF (m), variance (m2).
@@ -149,10 +149,8 @@ def update_static_window(state, settings):
     if window != Window.REST:
         state.window.still_samples = 0
     else:
-        changed = 1 if has_changed_lately(state) else 0
-        if state.window.still_samples == 0 or changed != state.window.still_changed:
-            state.window.still_samples = 0
-            state.window.still_changed = changed
+        state.window.still_changed = 1 if has_changed_lately(state) else 0
+        if state.window.still_samples == 0:
             for i in range(6):
                 state.window.still_total[i] = 0.0
             state.window.still_start = state.window.start
