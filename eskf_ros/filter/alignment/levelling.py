@@ -14,6 +14,7 @@ from eskf_ros.filter.inertial.navigation_frame import heading_of, local_up, rese
 from eskf_ros.filter.state.augmented_states import inflate_tilt_by_scale
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_CAPACITY, ERROR_SIZE, GYRO_BIAS
 from eskf_ros.filter.state.time import NEVER
+from eskf_ros.filter.stationarity.quiet_run import has_changed_lately
 from eskf_ros.filter.stationarity.residual_motion import can_be_bias, is_moving, note_sway, variance_of_half
 from eskf_ros.filter.stationarity.seen_motion import unseen_turn
 from eskf_ros.filter.stationarity.static_window import Window
@@ -78,8 +79,8 @@ def level(state, sums, count, interval, is_rest, settings):
         note_sway(state, is_first, settings)
         braking = state.window.still_speed / duration
         change, variance = change_of_gravity(state, settings)
-        is_turning = dot(change, change) > 0.0
-        if is_turning:
+        is_tilting = dot(change, change) > 0.0
+        if is_tilting:
             end = force_of_last_half(state)
             force = (end[0] - accel_bias[0], end[1] - accel_bias[1], end[2] - accel_bias[2])
             strength = math.sqrt(dot(force, force))
@@ -88,7 +89,7 @@ def level(state, sums, count, interval, is_rest, settings):
         is_remembered = accel_variance < settings.accel_bias_std**2
         turn_variance = 0.0 if is_remembered else variance / strength**2
         tilt_noise = tilt_noise_at_rest(state, duration, strength, braking, settings)
-        if is_turning:
+        if is_tilting:
             tilt_noise += variance_of_half(state) / strength**2
         if is_level_better_known(state, accel_variance / strength**2 + tilt_noise, braking):
             return
@@ -326,7 +327,7 @@ def update_gyro_bias_at_rest(state, prior_bias, prior, mean_rate, turn_variance,
         horizontal_variance = noise + horizontal_square * settings.initial_heading_std**2
     horizontal_variance += turn_variance
     # A turn that nothing excludes may be what the gyro reads.
-    vertical_variance += unseen_turn(state, state.window.still_changed == 1)
+    vertical_variance += unseen_turn(state, has_changed_lately(state))
     vertical_gain = prior / (prior + vertical_variance) if is_rest and prior > 0.0 else 0.0
     horizontal_gain = prior / (prior + horizontal_variance) if is_rest and prior > 0.0 else 0.0
     mean_map = rotate(

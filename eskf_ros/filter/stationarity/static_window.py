@@ -13,7 +13,6 @@ from eskf_ros.filter.inertial.navigation_frame import local_up
 from eskf_ros.filter.inertial.sample_quality import is_hidden
 from eskf_ros.filter.state.error_state import GYRO_BIAS, SOURCES
 from eskf_ros.filter.state.time import NEVER
-from eskf_ros.filter.stationarity.quiet_run import has_changed_lately
 from eskf_ros.filter.stationarity.residual_motion import MOVING_SPEED
 from eskf_ros.geodesy.earth import STANDARD_GRAVITY, geodetic_to_ecef
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix
@@ -32,7 +31,6 @@ STATIC_WINDOW = np.dtype(
         ("still_start", "i8"),
         ("still_force", "f8", (3,)),
         ("still_speed", "f8"),
-        ("still_changed", "i8"),
         ("motion_stamp", "i8"),
         ("disproofs", "i8", (SOURCES + 1,)),
         ("last_fix_stamp", "i8", (SOURCES,)),
@@ -50,8 +48,7 @@ sensors.
   ``half_samples``, ``half_force``: samples in its first half, and their force (m/s2).
 - ``still_stamp``, ``still_samples``, ``still_total``: the end of the last still window (ns), samples and sums of the
   run. ``still_start``, ``still_force``: the start of its first window (ns), and the mean force (m/s2) in the first half
-  of that. ``still_speed``: how fast the robot may have been then (m/s). ``still_changed``: whether the mean readings
-  have changed in the last seconds, as those of a robot that moves slowly do.
+  of that. ``still_speed``: how fast the robot may have been then (m/s).
 - ``motion_stamp``: when another sensor last proved motion (ns).
 - ``disproofs``: how many speeds in a row disprove the last level, from the fixes of each receiver and measured ones.
 - ``last_fix_*``: the last fix by receiver, because their antennas are apart: stamp (ns), ECEF (m), variance (m2).
@@ -149,7 +146,6 @@ def update_static_window(state, settings):
     if window != Window.REST:
         state.window.still_samples = 0
     else:
-        state.window.still_changed = 1 if has_changed_lately(state) else 0
         if state.window.still_samples == 0:
             for i in range(6):
                 state.window.still_total[i] = 0.0
