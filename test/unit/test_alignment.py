@@ -594,19 +594,19 @@ def test_a_robot_that_tilts_while_it_stands_has_no_other_gyro_bias(
 
 
 def test_a_robot_that_tilts_unevenly_is_levelled_where_it_is_at_the_end() -> None:
-    """It pitches by two degrees and part of the way back within 40 s. Since the last window it has gone 0.2 deg on."""
+    """It pitches by two degrees within 40 s, ever more slowly: the mean and its mean change do not tell where it is."""
     settings, state, rng = make_settings(alignment__static_duration=2.0), waiting(), np.random.default_rng(4)
     attitude = Rotation.identity()
     for k in range(round(40.0 * RATE_HZ)):
-        phase = 0.75 * math.pi * k / (40.0 * RATE_HZ)
+        phase = 0.5 * math.pi * k / (40.0 * RATE_HZ)
         attitude = Rotation.from_euler("y", 2.0 * math.sin(phase), degrees=True)
-        pitching = math.radians(2.0) * math.cos(phase) * 0.75 * math.pi / 40.0
+        pitching = math.radians(2.0) * math.cos(phase) * 0.5 * math.pi / 40.0
         force, rate = at_rest(state, attitude, np.zeros(3), np.zeros(3))
         state["stamp"] += 10_000_000
         state["specific_force"] = force + 0.01 * rng.normal(size=3)
         state["angular_rate"] = rate + (0.0, pitching, 0.0) + 1e-3 * rng.normal(size=3)
         update_rest(state, settings)
-    assert np.degrees(np.abs(tilt_error(state, attitude))).max() < 0.25
+    assert np.degrees(np.abs(tilt_error(state, attitude))).max() < 0.1
     assert np.abs(state["gyro_bias"]).max() < 3e-4
 
 
@@ -642,6 +642,13 @@ def test_the_rate_in_a_slow_bend_is_no_gyro_bias(first: float) -> None:
     assert at_rest["gyro_bias"][2] == pytest.approx(math.radians(first), abs=3e-4)
     for known in (at_rest, unseen):
         assert math.sqrt(core(known)[14, 14]) < 5e-4 < 0.1 * math.sqrt(core(state)[14, 14])
+
+
+def test_the_first_window_in_a_slow_bend_shows_no_gyro_bias() -> None:
+    """It ends with the block in which the rate has changed."""
+    state = level_in_bend([1.0, 1.3, 1.3], speed=1.0)
+    assert state["level_known"] == 1
+    assert math.sqrt(core(state)[14, 14]) > 5e-3
 
 
 def test_a_gentle_start_is_no_change_of_the_gyro_bias() -> None:

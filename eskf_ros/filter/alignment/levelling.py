@@ -79,8 +79,7 @@ def level(state, sums, count, interval, is_rest, settings):
         note_sway(state, is_first, settings)
         braking = state.window.still_speed / duration
         change, variance = change_of_gravity(state, settings)
-        is_tilting = dot(change, change) > 0.0
-        if is_tilting:
+        if dot(change, change) > 0.0:
             end = force_of_last_half(state)
             force = (end[0] - accel_bias[0], end[1] - accel_bias[1], end[2] - accel_bias[2])
             strength = math.sqrt(dot(force, force))
@@ -89,8 +88,6 @@ def level(state, sums, count, interval, is_rest, settings):
         is_remembered = accel_variance < settings.accel_bias_std**2
         turn_variance = 0.0 if is_remembered else variance / strength**2
         tilt_noise = tilt_noise_at_rest(state, duration, strength, braking, settings)
-        if is_tilting:
-            tilt_noise += variance_of_half(state) / strength**2
         if is_level_better_known(state, accel_variance / strength**2 + tilt_noise, braking):
             return
         state.levelling.unseen_braking = braking
