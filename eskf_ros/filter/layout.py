@@ -17,6 +17,7 @@ from eskf_ros.filter.alignment.heading_search import SEARCH
 from eskf_ros.filter.alignment.heading_sensors import CANDIDATE
 from eskf_ros.filter.alignment.levelling import LEVELLING
 from eskf_ros.filter.inertial.covariance import EXCITATION, TURNED_COLUMNS
+from eskf_ros.filter.inertial.gyro_noise import GYRO_NOISE
 from eskf_ros.filter.inertial.navigation_frame import FRAME
 from eskf_ros.filter.inertial.sample_quality import LEAST_FORCE_JUMP, LEAST_RATE_JUMP, SAMPLE_QUALITY
 from eskf_ros.filter.inertial.stamps import IMU_STAMPS
@@ -92,6 +93,7 @@ STATE = np.dtype(
         ("excitation", EXCITATION),
         ("stamps", IMU_STAMPS),
         ("quality", SAMPLE_QUALITY),
+        ("gyro_noise", GYRO_NOISE),
         ("frame", FRAME),
         ("odom", STEP),
         ("search", SEARCH),

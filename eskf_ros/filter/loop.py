@@ -23,6 +23,7 @@ from eskf_ros.filter.state.lanes import FILTER, HUMBLE, is_running
 from eskf_ros.filter.state.time import NEVER, SECOND
 from eskf_ros.filter.stationarity.detector import add_to_block
 from eskf_ros.filter.stationarity.residual_motion import add_to_part
+from eskf_ros.filter.stationarity.rest_noise import measure_gyro_noise
 from eskf_ros.filter.stationarity.static_window import Window, close_static_window, update_static_window
 from eskf_ros.filter.tight.epoch import end_of_epoch, fuse_ranges, is_range
 
@@ -109,6 +110,8 @@ def update_rest(state, settings):
     add_to_part(state)
     window = update_static_window(state, settings)
     if window != Window.OPEN:
+        if window != Window.MOTION:
+            measure_gyro_noise(state)
         watch_input(state, window != Window.MOTION, settings)
         update_level(state, window, settings)
         if window == Window.REST:

@@ -10,6 +10,7 @@ from eskf_ros.filter.inertial.covariance import (
     propagate_covariance,
     propagate_noise,
 )
+from eskf_ros.filter.inertial.gyro_noise import gyro_density
 from eskf_ros.filter.inertial.sample_doubt import credible_reading, shaken_density
 from eskf_ros.filter.inertial.strapdown import propagate_nominal_state
 from eskf_ros.filter.output.forward_log import carry_transition
@@ -50,7 +51,7 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
     rate_1 = augmented_states.unscaled(state, rate_1, state.gyro_bias, 3, settings)
     middle, force, gravity = propagate_nominal_state(state, force_0, rate_0, force_1, rate_1, dt, coupling)
     # Motion hidden by a gap is assumed to be constant; this density gives the same variance at its end.
-    accel_noise, gyro_noise, accel_walk, gyro_walk = imu_noise(state.doubt, state.bias_doubt, settings)
+    accel_noise, gyro_noise, accel_walk, gyro_walk = imu_noise(state, settings)
     velocity_noise = accel_noise + settings.gap_accel_std**2 * gap
     attitude_noise = gyro_noise + settings.gap_gyro_std**2 * gap
     if state.heading_known == 0:
@@ -79,16 +80,17 @@ def step(state, force_0, rate_0, force_1, rate_1, dt, gap, settings, work):
 
 
 @njit
-def imu_noise(doubt, bias_doubt, settings):
+def imu_noise(state, settings):
     """Return the spectral densities of accelerometer and gyro, and of the random walks of their biases.
 
-    They are those of the parameters for the doubt 0 (of white noise, of the biases), those of the humble lane for 1,
-    and geometric means between.
+    They are those of the parameters, or what the gyros have shown, for the doubt 0 (of white noise, of the biases),
+    those of the humble lane for 1, and geometric means between.
     """
-    humble = settings.humble_noise
+    doubt, bias_doubt, humble = state.doubt, state.bias_doubt, settings.humble_noise
+    gyro = gyro_density(state, settings) ** 2
     return (
         between_noise(settings.accel_noise_density**2, humble[0], doubt),
-        between_noise(settings.gyro_noise_density**2, humble[1], doubt),
+        between_noise(gyro, max(humble[1], gyro), doubt),
         between_noise(settings.accel_bias_random_walk**2, humble[2], bias_doubt),
         between_noise(settings.gyro_bias_random_walk**2, humble[3], bias_doubt),
     )

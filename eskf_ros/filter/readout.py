@@ -18,7 +18,7 @@ from eskf_ros.filter.integrity.receiver_report import aid_complaints, aid_notes
 from eskf_ros.filter.integrity.recovery import phase_of
 from eskf_ros.filter.integrity.repeated_fixes import repeat_complaints
 from eskf_ros.filter.integrity.report import gap_complaints, imu_faults, other_complaints
-from eskf_ros.filter.integrity.sample_report import axis_complaints, sample_complaints
+from eskf_ros.filter.integrity.sample_report import axis_complaints, noise_complaints, sample_complaints
 from eskf_ros.filter.integrity.traffic import Traffic, imu_complaints
 from eskf_ros.filter.layout import STATE
 from eskf_ros.filter.output.global_odometry import ODOMETRY, write_odometry
@@ -205,7 +205,8 @@ class Readout:
         inertial = imu_faults(state) + motion_complaints(state)
         samples = sample_complaints(state) + gap_complaints(state)
         travel, is_fault = travel_complaints(state, settings, self.parameters.imu.mount_rpy_deg)
-        found = inertial + other_complaints(state) + repeat_complaints(state) + samples + (travel if is_fault else [])
+        found = inertial + other_complaints(state) + repeat_complaints(state) + samples
+        found += noise_complaints(state, settings) + (travel if is_fault else [])
         # A wrong heading makes the fixes look faulty: warnings about the receivers would mislead.
         if not is_heading_contradicted(state):
             # Clocks that may be apart are told after some more turns, and would explain much.

@@ -171,6 +171,20 @@ def test_advice_that_is_followed_helps(name: str, given: Filter, parameters: tup
         assert run.followed < 0.5 * run.before
 
 
+def test_gyro_noise_that_was_told_too_small_is_measured_at_rest_and_allowed_for() -> None:
+    """Told a tenth, the heading would be beyond five sigma for a tenth of the time; now it is as if it were told."""
+    name = "10 times the noise"
+    trace = run_named(name, TOLD_POSITION, 0)
+    is_judged = trace.is_known & (trace.seconds > 140.0)
+    square = (trace.heading_error / trace.heading_sigma)[is_judged] ** 2
+    assert square.mean() < 3.0
+    assert square.max() < 16.0
+    run = follow(BY_NAME[name], 0, TOLD_POSITION)
+    assert run.advised == ("imu.gyro_noise_density",)
+    assert not run.wrong
+    assert run.followed < 1.1 * run.before
+
+
 def test_advice_is_read_from_sentences() -> None:
     said = [
         "the fixes are stamped 0.251 s (+- 0.010) late: set gnss.time_offset to -0.251, or synchronise the clocks",

@@ -16,6 +16,7 @@ import numpy as np
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.heading_search import LENGTH_TOLERANCE, agrees_with_search, is_faster_than, nis_of_pair
+from eskf_ros.filter.inertial.gyro_noise import gyro_density
 from eskf_ros.filter.inertial.navigation_frame import body_rate
 from eskf_ros.filter.state.error_state import GYRO_BIAS
 from eskf_ros.filter.state.time import NEVER
@@ -82,7 +83,7 @@ def turn_from_spot(state, measured, source, settings, work):
     for i in range(3):
         gyro_variance = max(gyro_variance, state.covariance[GYRO_BIAS + i, GYRO_BIAS + i])
     age = (state.stamp - spot.begin_stamp) * 1e-9
-    drift = settings.gyro_noise_density**2 + 2.0 * gyro_variance * age
+    drift = gyro_density(state, settings) ** 2 + 2.0 * gyro_variance * age
     for i in range(2):
         p[i, i] += CENTRE_WALK**2 * dt
         p[2 + i, 2 + i] += drift * dt

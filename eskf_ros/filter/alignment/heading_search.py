@@ -21,6 +21,7 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.inertial.gyro_noise import gyro_density
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, GYRO_BIAS
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.geodesy.earth import STANDARD_GRAVITY
@@ -181,8 +182,9 @@ def predict_search(state, acceleration, rotation, dt, settings):
         gyro_variance = max(gyro_variance, state.covariance[GYRO_BIAS + i, GYRO_BIAS + i])
         accel_variance = max(accel_variance, state.covariance[ACCEL_BIAS + i, ACCEL_BIAS + i])
     # A constant rate error turns by its std times the age: variance std^2 age^2, of which this is the growth.
-    drift = settings.gyro_noise_density**2 + 2.0 * gyro_variance * state.search.age
-    turn_drift = settings.gyro_noise_density**2 + 2.0 * gyro_variance * state.search.turning_age
+    white = gyro_density(state, settings) ** 2
+    drift = white + 2.0 * gyro_variance * state.search.age
+    turn_drift = white + 2.0 * gyro_variance * state.search.turning_age
     velocity_noise = settings.accel_noise_density**2 + LEANING_TIME * leaning * accel_variance
     for i in range(2):
         p[2 + i, 2 + i] += velocity_noise * dt

@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.inertial.gyro_noise import gyro_density
 from eskf_ros.geodesy.earth import EARTH_RATE, STANDARD_GRAVITY
 from eskf_ros.geodesy.rotation import dot
 
@@ -49,7 +50,7 @@ def do_biases_hold(state, mean_force, mean_rate, duration, still, settings):
         return False
     if not still:
         return True
-    rate_std = math.sqrt(settings.remembered_gyro_bias_std**2 + settings.gyro_noise_density**2 / duration)
+    rate_std = math.sqrt(settings.remembered_gyro_bias_std**2 + gyro_density(state, settings) ** 2 / duration)
     for i in range(3):
         if abs(mean_rate[i] - settings.remembered_gyro_bias[i]) > CONTRADICTION * rate_std + EARTH_RATE:
             return False

@@ -26,7 +26,8 @@ def clear_doubt(quality):
 
 @njit
 def copy_doubt(state, lane):
-    """Let another lane know which axes of the interval are doubted, and how much readings change."""
+    """Let another lane know which axes are doubted, how much readings change, and how noisy the gyros are."""
+    lane.gyro_noise.density = state.gyro_noise.density
     for i in range(6):
         lane.quality.change[i] = state.quality.change[i]
         lane.quality.bend[i] = state.quality.bend[i]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from eskf_ros.filter.inertial.gyro_noise import CLEARLY_MORE
+
 AXES = ("x accelerometer", "y accelerometer", "z accelerometer", "x gyro", "y gyro", "z gyro")
 
 UNITS = ("m/s2", "m/s2", "m/s2", "rad/s", "rad/s", "rad/s")
@@ -62,6 +64,17 @@ def axis_complaints(state: np.void) -> list[str]:
                 "sensor and its driver"
             )
     return found
+
+
+def noise_complaints(state: np.void, settings: np.void) -> list[str]:
+    """Return a sentence if the gyros are clearly noisier at rest than the parameters say."""
+    told, measured = float(settings["gyro_noise_density"]), float(state["gyro_noise"]["density"])
+    if measured <= CLEARLY_MORE * told:
+        return []
+    return [
+        f"at rest the gyros are {measured / told:.1f} times as noisy as told, which is allowed for: set "
+        f"imu.gyro_noise_density to {measured:.2g}"
+    ]
 
 
 def sample_complaints(state: np.void) -> list[str]:

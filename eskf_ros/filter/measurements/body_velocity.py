@@ -14,8 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.inertial.gyro_noise import gyro_noise_variance
 from eskf_ros.filter.inertial.navigation_frame import body_rate
-from eskf_ros.filter.measurements.jacobians import clear, gyro_noise_variance, point_velocity, set_point_velocity_row
+from eskf_ros.filter.measurements.jacobians import clear, point_velocity, set_point_velocity_row
 from eskf_ros.filter.measurements.row import (
     BARE_TWIST,
     HIGHEST_SPEED,

@@ -12,6 +12,7 @@ from typing import Any
 import numpy.typing as npt
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.inertial.gyro_noise import gyro_noise_variance
 from eskf_ros.filter.inertial.navigation_frame import body_rate, local_east_north_up_to_ecef
 from eskf_ros.filter.inertial.sample_doubt import shaken_velocity
 from eskf_ros.filter.measurements.antenna import antenna_velocity, carry_velocity, lever_arm_of, set_lever_arm
@@ -97,7 +98,7 @@ def linearize_antenna(state, measured, source, settings, work):
     lever = rotate(rotation, arm)
     lever_velocity = rotate(rotation, cross(body_rate(state, rotation), arm))
     # The gyro reading of this instant carries the white noise of one sample.
-    rate_variance = settings.gyro_noise_density**2 / state.imu.interval
+    rate_variance = gyro_noise_variance(state, settings)
     for i in range(3):
         for j in range(3):
             work.noise[i, j] -= rate_variance * lever[i] * lever[j]

@@ -125,12 +125,6 @@ def set_mounting(jacobian, row, yaw_part, pitch_part, state, settings):
 
 
 @njit
-def gyro_noise_variance(state, settings):
-    """Return the variance (rad2/s2 per axis) of the white noise of a single gyro reading."""
-    return settings.gyro_noise_density**2 / state.imu.interval
-
-
-@njit
 def horizontal_acceleration(state, rotation, force):
     """Return the size (m/s2) of the horizontal acceleration for a raw specific force (m/s2, IMU axes)."""
     b = state.accel_bias

@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.inertial.gyro_noise import gyro_noise_variance
 from eskf_ros.filter.inertial.navigation_frame import body_rate
 from eskf_ros.filter.measurements.jacobians import (
     clear,
-    gyro_noise_variance,
     horizontal_acceleration,
     mounting_of,
     point_velocity,

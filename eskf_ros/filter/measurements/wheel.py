@@ -22,11 +22,11 @@ import numpy.typing as npt
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.history.records import XX, XY, YY
+from eskf_ros.filter.inertial.gyro_noise import gyro_noise_variance
 from eskf_ros.filter.inertial.navigation_frame import body_rate
 from eskf_ros.filter.inertial.strapdown import gravity_map
 from eskf_ros.filter.measurements.jacobians import (
     clear,
-    gyro_noise_variance,
     horizontal_acceleration,
     mounting_of,
     point_velocity,

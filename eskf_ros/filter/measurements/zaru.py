@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.inertial.gyro_noise import gyro_density
 from eskf_ros.filter.measurements.jacobians import clear, set_identity
 from eskf_ros.filter.measurements.row import Row
 from eskf_ros.filter.measurements.zupt import CONSTRAINT_GATE_PROBABILITY, is_enabled
@@ -62,7 +63,7 @@ def linearize(state, settings, work):
     clear(work)
     measured, predicted = mean_rate(state), predict(state)
     rotation = to_matrix(state.attitude)
-    density = settings.gyro_noise_density
+    density = gyro_density(state, settings)
     shared = density**2 * remaining_share(state, density)
     set_identity(work.jacobian, GYRO_BIAS)
     for i in range(SIZE):

@@ -8,6 +8,7 @@ import numpy as np
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.levelling import UNKNOWN_SPEED
+from eskf_ros.filter.inertial.gyro_noise import gyro_noise_variance
 from eskf_ros.filter.inertial.navigation_frame import body_rate, heading_of
 from eskf_ros.filter.integrity.fix_errors import held_variance
 from eskf_ros.filter.integrity.motion_monitor import lag_of_receiver, offset_by_jumps
@@ -182,7 +183,7 @@ def write_twist_covariance(state, base_to_map, settings, row):
     # The velocity by the lever arm is known in body axes: an attitude error turns only the velocity of the IMU.
     velocity = (state.velocity_map[0], state.velocity_map[1], state.velocity_map[2])
     # The rate error times the lever arm is neglected: it adds millimetres per second.
-    rate_variance = settings.gyro_noise_density**2 / state.imu.interval
+    rate_variance = gyro_noise_variance(state, settings)
     for i in range(3):
         forward_i = (base_to_map[0][i], base_to_map[1][i], base_to_map[2][i])
         lever_i = cross(forward_i, velocity)

@@ -14,6 +14,7 @@ import numpy as np
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.levelling import UNKNOWN_SPEED
+from eskf_ros.filter.inertial.gyro_noise import gyro_density
 from eskf_ros.filter.inertial.navigation_frame import heading_of
 from eskf_ros.filter.state.error_state import GYRO_BIAS, VELOCITY
 from eskf_ros.filter.state.time import NEVER
@@ -108,6 +109,6 @@ def carry(local, state, settings):
         )
         velocity_variance = STILL_SPEED**2 if at_rest else UNKNOWN_SPEED**2
     heading_std = math.sqrt(local.heading_variance) + math.sqrt(bias_variance) * dt
-    local.heading_variance = heading_std**2 + settings.gyro_noise_density**2 * dt
+    local.heading_variance = heading_std**2 + gyro_density(state, settings) ** 2 * dt
     drift = math.sqrt(velocity_variance) * dt + math.sqrt(x * x + y * y) * heading_std
     local.position_variance = (math.sqrt(local.position_variance) + drift) ** 2

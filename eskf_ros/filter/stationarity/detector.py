@@ -22,6 +22,7 @@ import numpy as np
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.history.records import XX, YY, ZZ
+from eskf_ros.filter.inertial.gyro_noise import gyro_density
 from eskf_ros.filter.inertial.sample_quality import is_hidden
 from eskf_ros.filter.state.enums import CONSTRAINT_INTERVAL, Stream, Verdict
 from eskf_ros.filter.state.error_state import GYRO_BIAS, VELOCITY
@@ -214,7 +215,7 @@ def is_steady(state, settings):
         if i < 3:
             variance = 2.0 * settings.accel_noise_density**2 / half + sway
         else:
-            variance = 2.0 * settings.gyro_noise_density**2 / half + 4.0 * settings.zupt.rate_std**2
+            variance = 2.0 * gyro_density(state, settings) ** 2 / half + 4.0 * settings.zupt.rate_std**2
         if change * change > STEADY_SIGMAS**2 * variance:
             return False
     return True

@@ -12,6 +12,7 @@ import math
 import numpy as np
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.inertial.gyro_noise import gyro_density
 from eskf_ros.filter.state.error_state import VELOCITY
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.geodesy.earth import EARTH_RATE
@@ -138,9 +139,16 @@ def sway_variance(state, first, noise_density):
     white = noise_density**2 / (PART * 1e-9)
     largest = 0.0
     for i in range(first, first + 3):
-        mean = state.residual.part_mean_sum[i] / n
-        largest = max(largest, (state.residual.part_square_sum[i] / n - mean * mean) * n / (n - 1))
+        largest = max(largest, scatter_of_parts(state, i))
     return largest if largest > MORE_THAN_NOISE * white else 0.0
+
+
+@njit
+def scatter_of_parts(state, i):
+    """Return the variance of the means of the parts; axis ``i``: 0 to 2 force ((m/s2)2), 3 to 5 rate ((rad/s)2)."""
+    n = state.residual.parts
+    mean = state.residual.part_mean_sum[i] / n
+    return (state.residual.part_square_sum[i] / n - mean * mean) * n / (n - 1)
 
 
 @njit
@@ -166,7 +174,7 @@ def variance_of_half(state):
 def note_sway(state, is_first, settings):
     """Keep the largest residual motion in a run of still windows; ``is_first``: this window is the first of the run."""
     force = sway_variance(state, 0, settings.accel_noise_density)
-    rate = sway_variance(state, 3, settings.gyro_noise_density)
+    rate = sway_variance(state, 3, gyro_density(state, settings))
     state.residual.force_variance = force if is_first else max(state.residual.force_variance, force)
     state.residual.rate_variance = rate if is_first else max(state.residual.rate_variance, rate)
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 
 from eskf_ros.compiled import njit
+from eskf_ros.filter.inertial.gyro_noise import gyro_noise_variance
 from eskf_ros.filter.inertial.navigation_frame import body_rate
 from eskf_ros.filter.measurements.jacobians import clear, let_heading_be_held
 from eskf_ros.filter.measurements.row import Row
@@ -86,7 +87,7 @@ def linearize(state, payload, settings, work):
     lever_velocity = rotate(rotation, cross(body_rate(state, rotation), arm))
     across = cross(unit, lever)
     # The gyro reading of this instant carries the white noise of one sample.
-    gyro_variance = settings.gyro_noise_density**2 / state.imu.interval * dot(across, across)
+    gyro_variance = gyro_noise_variance(state, settings) * dot(across, across)
     work.noise[0, 0] = variance(payload, settings) + gyro_variance
     for i in range(3):
         work.jacobian[0, POSITION + i] = -turning[i]
