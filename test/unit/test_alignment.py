@@ -610,6 +610,54 @@ def test_a_robot_that_tilts_unevenly_is_levelled_where_it_is_at_the_end() -> Non
     assert np.abs(state["gyro_bias"]).max() < 3e-4
 
 
+def started_gently(
+    seconds_at_rest: float, jerk: float, pitching_deg: float = 0.0, speed_std: float = 0.3, seconds: float = 6.0
+) -> Any:
+    """Return a filter ``seconds`` after a robot began to speed up along x, ``jerk`` m/s3.
+
+    It pitches (deg/s) all the time. Its other sensors exclude no speed of ``speed_std`` (m/s).
+    """
+    settings = make_settings(alignment__static_duration=2.0, imu__gyro_noise_density=5e-5)
+    state, rng = waiting(), np.random.default_rng(6)
+    state["seen"]["stamp"][0] = state["stamp"]
+    state["seen"]["velocity_variance"][0] = speed_std**2
+    pitching = math.radians(pitching_deg)
+    for k in range(round((seconds_at_rest + seconds) * RATE_HZ)):
+        time = k / RATE_HZ
+        force, rate = at_rest(state, Rotation.from_euler("y", pitching * time), np.zeros(3), np.zeros(3))
+        state["stamp"] += 10_000_000
+        state["specific_force"] = (
+            force + (jerk * max(time - seconds_at_rest, 0.0), 0.0, 0.0) + 0.01 * rng.normal(size=3)
+        )
+        state["angular_rate"] = rate + (0.0, pitching, 0.0) + 1e-3 * rng.normal(size=3)
+        update_rest(state, settings)
+    return state
+
+
+@pytest.mark.parametrize("seconds_at_rest", [20.0, 20.5, 21.0, 21.5])
+def test_a_gentle_start_is_no_tilt(seconds_at_rest: float) -> None:
+    """No other sensor has seen it yet, and its readings are as quiet as at rest: but the gyros have seen no turn."""
+    for jerk in (0.02, 0.05, 0.1, 0.2, -0.1):
+        state = started_gently(seconds_at_rest, jerk)
+        assert np.degrees(np.abs(tilt_error(state, Rotation.identity()))).max() < 0.025
+        assert np.degrees(np.abs(state["gyro_bias"])).max() < 0.02
+
+
+@pytest.mark.parametrize("jerk", [0.035, -0.017, -0.03])
+def test_a_start_in_the_first_seconds_is_no_turn_of_the_body(jerk: float) -> None:
+    """Gravity that seems to turn is an acceleration that grows, as long as nothing excludes the speed it leads to."""
+    state = started_gently(0.0, jerk)
+    assert np.degrees(np.abs(state["gyro_bias"])).max() < 0.02
+    tilting = started_gently(0.0, jerk, pitching_deg=0.1)
+    assert abs(tilting["gyro_bias"][1]) < 3.0 * math.sqrt(core(tilting)[13, 13])
+
+
+def test_a_turn_that_is_proven_may_have_been_a_start_in_part() -> None:
+    state = started_gently(0.0, 0.01, pitching_deg=0.4, speed_std=0.02, seconds=2.1)
+    assert math.radians(0.04) < abs(state["gyro_bias"][1]) < math.radians(0.1)
+    assert abs(state["gyro_bias"][1]) < 2.0 * math.sqrt(core(state)[13, 13])
+
+
 def level_in_bend(rates_deg: Any, speed: float | None, step: float = 0.0) -> Any:
     """Show the stillness watch a yaw rate (deg/s) for a second each; fixes have seen a speed (m/s), or nothing.
 

@@ -10,14 +10,15 @@ from eskf_ros.compiled import njit
 from eskf_ros.filter.alignment.heading import reset_heading
 from eskf_ros.filter.alignment.heading_search import note_level
 from eskf_ros.filter.alignment.warm_start import do_biases_hold
+from eskf_ros.filter.inertial.gyro_noise import gyro_density
 from eskf_ros.filter.inertial.navigation_frame import heading_of, local_up, reset_attitude, shortest_turn
 from eskf_ros.filter.state.augmented_states import inflate_tilt_by_scale
 from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_CAPACITY, ERROR_SIZE, GYRO_BIAS
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity.quiet_run import has_changed_lately
 from eskf_ros.filter.stationarity.residual_motion import can_be_bias, is_moving, note_sway, variance_of_half
-from eskf_ros.filter.stationarity.seen_motion import unseen_turn
-from eskf_ros.filter.stationarity.static_window import Window
+from eskf_ros.filter.stationarity.seen_motion import unseen_speed, unseen_turn
+from eskf_ros.filter.stationarity.static_window import Window, force_of_last_half
 from eskf_ros.geodesy.earth import EARTH_RATE, STANDARD_GRAVITY
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix, wrapped
 
@@ -134,7 +135,7 @@ def can_be_rest(state, rate, gyro_bias, gyro_variance, duration, settings):
     """Say whether quiet readings can be those of rest: no even braking, no slow turn, no unexpected bias."""
     if state.residual.moved_first == 1 or is_moving(state):
         return False
-    return can_be_bias(rate, gyro_bias, math.sqrt(gyro_variance), mean_rate_std(duration, settings))
+    return can_be_bias(rate, gyro_bias, math.sqrt(gyro_variance), mean_rate_std(state, duration, settings))
 
 
 @njit
@@ -163,27 +164,25 @@ def change_of_gravity(state, settings):
     It is that from the first half of its first window to the second half of its last one, and zero where it is no more
     than noise, or noise hides it. A robot that tilts while it stands, as one that is loaded does, would pass for one
     with another gyro bias.
+
+    Nor is it a turn where it may be the acceleration of a robot that sets out, growing by j in each of T seconds up to
+    a speed of j T^2 / 2 that its sensors do not exclude. What is no proven turn may be one all the same.
     """
     window, variance = state.window, variance_of_half(state)
     if variance == 0.0:
         return (0.0, 0.0, 0.0), 0.0
-    passed = (state.stamp - window.still_start) * 1e-9 - 0.5 * settings.static_duration
+    duration = (state.stamp - window.still_start) * 1e-9
+    passed = duration - 0.5 * settings.static_duration
     variance *= 2.0 / passed**2
     if variance > LARGEST_CHANGE_STD**2:
         return (0.0, 0.0, 0.0), 0.0
     end, start = force_of_last_half(state), window.still_force
     change = ((end[0] - start[0]) / passed, (end[1] - start[1]) / passed, (end[2] - start[2]) / passed)
-    if dot(change, change) > TURN_SIGMAS**2 * (variance + LEAST_TURN**2):
-        return change, variance
-    return (0.0, 0.0, 0.0), variance
-
-
-@njit
-def force_of_last_half(state):
-    """Return the mean force (m/s2, IMU axes) in the second half of the window: gravity at the end of a turn."""
-    window = state.window
-    n, total, half = window.samples - window.half_samples, window.total, window.half_force
-    return ((total[0] - half[0]) / n, (total[1] - half[1]) / n, (total[2] - half[2]) / n)
+    start_variance = 4.0 * unseen_speed(state) / duration**4
+    square = dot(change, change)
+    if square > TURN_SIGMAS**2 * (variance + start_variance + LEAST_TURN**2):
+        return change, variance + start_variance
+    return (0.0, 0.0, 0.0), variance + square
 
 
 @njit
@@ -289,9 +288,9 @@ def update_level_in_motion(state, settings):
 
 
 @njit
-def mean_rate_std(duration, settings):
+def mean_rate_std(state, duration, settings):
     """Return the standard deviation (rad/s) of the mean rate at rest over ``duration`` (s) about the present bias."""
-    white = settings.gyro_noise_density**2 / duration
+    white = gyro_density(state, settings) ** 2 / duration
     return math.sqrt(white + settings.gyro_bias_random_walk**2 * duration / 3.0)
 
 
@@ -306,7 +305,7 @@ def update_gyro_bias_at_rest(state, prior_bias, prior, mean_rate, turn_variance,
     part enters the variance.
     """
     rotation = to_matrix(state.attitude)
-    noise = mean_rate_std(duration, settings) ** 2
+    noise = mean_rate_std(state, duration, settings) ** 2
     if is_rest:
         noise += sway_left(state.residual.rate_variance, duration, settings)
     earth = state.frame.earth_rate_map

@@ -263,14 +263,21 @@ def unseen_turn(state, has_changed):
     last = state.seen.turn_stamp
     if last != NEVER and state.stamp - last <= LONGEST_TURN:
         return state.seen.turn_rate**2 + state.seen.turn_rate_variance
-    if not has_changed:
-        return 0.0
+    return unseen_speed(state) / TURN_RADIUS**2 if has_changed else 0.0
+
+
+@njit
+def unseen_speed(state):
+    """Return the mean square ((m/s)2) of a horizontal speed that the sensors do not exclude.
+
+    It is 0 where none of them has spoken: robots start at rest.
+    """
     square = math.inf
     for eye in range(EYES):
         if state.seen.stamp[eye] != NEVER:
             v, p = state.seen.velocity[eye], state.seen.velocity_variance[eye]
             square = min(square, v[0] ** 2 + v[1] ** 2 + p[0] + p[1])
-    return square / TURN_RADIUS**2 if square < math.inf else 0.0
+    return square if square < math.inf else 0.0
 
 
 @njit

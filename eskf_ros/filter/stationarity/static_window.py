@@ -9,11 +9,12 @@ import numpy as np
 
 from eskf_ros.compiled import njit
 from eskf_ros.filter.history.records import XX, YY, ZZ
+from eskf_ros.filter.inertial.gyro_noise import gyro_density
 from eskf_ros.filter.inertial.navigation_frame import local_up
 from eskf_ros.filter.inertial.sample_quality import is_hidden
 from eskf_ros.filter.state.error_state import GYRO_BIAS, SOURCES
 from eskf_ros.filter.state.time import NEVER
-from eskf_ros.filter.stationarity.residual_motion import MOVING_SPEED
+from eskf_ros.filter.stationarity.residual_motion import MOVING_SPEED, variance_of_half
 from eskf_ros.geodesy.earth import STANDARD_GRAVITY, geodetic_to_ecef
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix
 
@@ -63,15 +64,15 @@ differenced, and over fractions of a second: at three standard deviations a park
 VELOCITY_SIGMAS = 3.0
 """Standard deviations by which a GNSS velocity must exceed `MOVING_SPEED` to prove motion."""
 
-REST_TOLERANCE = 0.2
-"""m/s2; change of the horizontal mean specific force that a robot at rest may show while its springs settle."""
+LEAST_FORCE = 0.01
+"""m/s2 (0.06 deg of tilt); the horizontal specific force that readings at rest scatter by, at least."""
 
 BRAKING_SIGMAS = 3.0
 """Ratio of the change of the mean specific force to an acceleration that the last level may hold unseen, up to which
 the robot has only ceased to brake."""
 
-REST_RATE_SIGMAS = 4.0
-"""Standard deviations by which the mean rate at rest may differ from the estimated gyro bias plus Earth rate."""
+REST_SIGMAS = 4.0
+"""Standard deviations by which the mean rate at rest may differ from gyro bias plus Earth rate, and gravity from up."""
 
 STRONGEST_START = 5.0
 """m/s2; no robot gathers speed faster."""
@@ -234,6 +235,14 @@ def is_still(state, settings):
 
 
 @njit
+def force_of_last_half(state):
+    """Return the mean force (m/s2, IMU axes) in the second half of the window: gravity at the end of a turn."""
+    window = state.window
+    n, total, half = window.samples - window.half_samples, window.total, window.half_force
+    return ((total[0] - half[0]) / n, (total[1] - half[1]) / n, (total[2] - half[2]) / n)
+
+
+@njit
 def is_same_rest(state, settings):
     """Say whether mean rate and gravity agree with the last still window, so that both windows are the same rest.
 
@@ -244,19 +253,19 @@ def is_same_rest(state, settings):
         return True
     n = state.window.samples
     earth = rotate_back(to_matrix(state.attitude), state.frame.earth_rate_map)
-    noise = settings.gyro_noise_density**2 / ((state.stamp - state.window.start) * 1e-9)
+    noise = gyro_density(state, settings) ** 2 / ((state.stamp - state.window.start) * 1e-9)
     walked = settings.gyro_bias_random_walk**2 * (state.stamp - state.window.still_stamp) * 1e-9
     for i in range(3):
         excess = state.window.total[3 + i] / n - state.gyro_bias[i] - earth[i]
         variance = state.covariance[GYRO_BIAS + i, GYRO_BIAS + i] + noise + walked
-        if excess * excess > REST_RATE_SIGMAS**2 * variance:
+        if excess * excess > REST_SIGMAS**2 * variance:
             return False
-    force = (state.window.total[0] / n, state.window.total[1] / n, state.window.total[2] / n)
-    force_map = rotate(to_matrix(state.attitude), force)
+    force_map = rotate(to_matrix(state.attitude), force_of_last_half(state))
     sideways = cross(local_up(state), force_map)
-    bias_variance = 0.0
+    variance = 0.0
     for i in range(3):
-        bias_variance = max(bias_variance, state.covariance[GYRO_BIAS + i, GYRO_BIAS + i])
-    drift = 3.0 * math.sqrt(bias_variance) * (state.stamp - state.window.still_stamp) * 1e-9
-    tolerance = REST_TOLERANCE + STANDARD_GRAVITY * drift + BRAKING_SIGMAS * state.levelling.unseen_braking
+        variance = max(variance, state.covariance[GYRO_BIAS + i, GYRO_BIAS + i])
+    variance = variance * ((state.stamp - state.window.still_stamp) * 1e-9 * STANDARD_GRAVITY) ** 2
+    variance += LEAST_FORCE**2 + variance_of_half(state)
+    tolerance = REST_SIGMAS * math.sqrt(variance) + BRAKING_SIGMAS * state.levelling.unseen_braking
     return math.sqrt(dot(sideways, sideways)) < tolerance
