@@ -104,6 +104,15 @@ def test_a_filled_hole_costs_what_a_hole_costs(kind: str) -> None:
     assert sentence.startswith("1 holes in the IMU data are filled")
 
 
+def test_an_extreme_that_is_sent_again_is_no_end_of_the_range() -> None:
+    """A hole filled with the hardest braking of the drive: 160 readings of the lowest value, to the last bit."""
+    values = filled("repeated")
+    values[HOLE, 0] = values[:, 0].min() - 0.1
+    state, _ = run(values)
+    (sentence,) = sample_complaints(state)
+    assert sentence.startswith("1 holes in the IMU data are filled")
+
+
 @pytest.mark.parametrize("is_turning", [False, True])
 def test_while_standing_a_repeated_sample_costs_nothing(is_turning: bool) -> None:
     """But where it turns, a robot does not stand, however slow it is."""

@@ -153,6 +153,7 @@ def judge_sample(state, sample, instant, settings):
     # How usual repetitions are is not learnt from those that are out of the ordinary.
     weight = 0.0 if quality.is_doubted == 1 else 1.0 / min(quality.count, MEMORY)
     equal, on_line, noisy, jumps, ends = 0, 0, 0, 0, 0
+    is_new = not is_repeated(state, sample)
     for i in range(6):
         change, bend = differences(state, sample, i, ratio)
         is_equal = change == 0.0
@@ -161,7 +162,9 @@ def judge_sample(state, sample, instant, settings):
         noisy += quality.bend[i] > NOISY * quality.change[i]
         jump = jump_of(state, sample, i)
         jumps += jump * jump > max(quality.least_jump[i], OUTLIER * quality.change[i])
-        learn(quality, i, read(sample, i), change, bend, is_equal, weight)
+        if is_new:
+            learn_range(quality, i, read(sample, i))
+        learn(quality, i, change, bend, is_equal, weight)
         ends += is_end_of_range(quality, i, read(sample, i))
     if equal > 0 or quality.any_equal == 1:
         count_equal(state, quality, sample, interval)
@@ -189,6 +192,15 @@ def judge_sample(state, sample, instant, settings):
 def read(sample, i):
     """Return the reading of an axis in a sample."""
     return sample.specific_force[i] if i < 3 else sample.angular_rate[i - 3]
+
+
+@njit
+def is_repeated(state, sample):
+    """Say whether a sample is the last one again, in all axes."""
+    for i in range(6):
+        if read(sample, i) != last_reading(state, i):
+            return False
+    return True
 
 
 @njit
@@ -238,18 +250,23 @@ def count_equal(state, quality, sample, interval):
 
 
 @njit
-def learn(quality, i, new, change, bend, is_equal, weight):
-    """Learn how an axis changes, what its range is, and how usual it is that it repeats a reading.
-
-    ``bend`` is the square of the second difference, ``weight`` that of a new sample in the shares. Nothing is learnt of
-    noise where the readings are on a line.
-    """
+def learn_range(quality, i, new):
+    """Learn the range of an axis, and how often it reads the ends. A sample that is sent again says nothing of them."""
     if new <= quality.lowest[i]:
         quality.at_extreme[i, 0] = quality.at_extreme[i, 0] + 1 if new == quality.lowest[i] else 1
         quality.lowest[i] = new
     if new >= quality.highest[i]:
         quality.at_extreme[i, 1] = quality.at_extreme[i, 1] + 1 if new == quality.highest[i] else 1
         quality.highest[i] = new
+
+
+@njit
+def learn(quality, i, change, bend, is_equal, weight):
+    """Learn how an axis changes, and how usual it is that it repeats a reading.
+
+    ``bend`` is the square of the second difference, ``weight`` that of a new sample in the shares. Nothing is learnt of
+    noise where the readings are on a line.
+    """
     share = quality.equal_share[i]
     quality.equal_share[i] = max(share + weight * (is_equal - share), LEAST_SHARE)
     is_first = quality.count <= FIRST_SAMPLES
