@@ -322,13 +322,18 @@ def test_a_section_of_a_document_is_replaced_and_the_others_stay(tmp_path: Path)
     assert document.read_text() == "# Trust\n\n## Bars\n\nfour\n\n## Names\n\ntwo\n\n### deeper\n\nthree\n"
 
 
-def test_drives_of_the_other_generator_are_what_their_files_say() -> None:
-    """Its own truth, differentiated, feels what its IMU measures; so frames, signs and times are understood."""
+@pytest.fixture
+def other_drives() -> Path:
+    """The folder with the drives of the other generator; the test is skipped without it."""
     try:
-        folder = find_data_folder(FOLDER)
+        return find_data_folder(FOLDER)
     except FileNotFoundError as problem:
         pytest.skip(str(problem))
-    recording = recording_from(folder, CLEAN, 2)
+
+
+def test_drives_of_the_other_generator_are_what_their_files_say(other_drives: Path) -> None:
+    """Its own truth, differentiated, feels what its IMU measures; so frames, signs and times are understood."""
+    recording = recording_from(other_drives, CLEAN, 2)
     trace = run_one(CLEAN, recording, DEFAULT_VELOCITY)
     settled = trace.seconds > 150.0
     assert trace.error[settled].max() < 1.5
@@ -336,3 +341,21 @@ def test_drives_of_the_other_generator_are_what_their_files_say() -> None:
     given = Fault("given", Kind.MOTION, given_heading_std_deg=5.0, given_heading_off_deg=25.0)
     found = parameters_of(given, recording, True)
     assert found["alignment.initial_heading_deg"] == pytest.approx(heading_at_start_deg(recording) + 25.0)
+
+
+@pytest.mark.parametrize("given", [TOLD_VELOCITY, DEFAULT_POSITION], ids=str)
+def test_clean_drives_of_the_other_generator_are_complained_of_by_nothing(given: Filter, other_drives: Path) -> None:
+    """Two cars that start gently, one of them after 20 s at rest, and tilt while they stand."""
+    for seed in range(3):
+        trace = run_one(CLEAN, recording_from(other_drives, CLEAN, seed), given)
+        assert trace.final == ()
+        assert np.abs(trace.heading_error / trace.heading_sigma)[trace.is_known].max() < 5.0
+
+
+def test_a_gyro_that_is_stuck_blames_no_axes_and_no_clocks(other_drives: Path) -> None:
+    """What it does not measure says nothing of axes, mounting and clocks."""
+    fault = BY_NAME["one gyro stuck for 40 s"]
+    for seed in range(3):
+        trace = run_one(fault, recording_from(other_drives, fault, seed), TOLD_VELOCITY)
+        assert figures_of(fault, trace).wrong == ()
+        assert [text for text in trace.final if "stuck" in text]

@@ -142,10 +142,10 @@ SAME_VELOCITY = 0.3
 
 @njit
 def add_sample(state):
-    """Add the newest IMU reading to the integrals of the window."""
+    """Add the newest IMU reading to the integrals of the window, unless an axis does not measure (`sample_doubt`)."""
     motion, interval = state.motion, state.imu.interval
     motion.longest_interval = max(motion.longest_interval, interval)
-    if interval > LONGEST_HOLE:
+    if interval > LONGEST_HOLE or state.quality.is_doubted == 1:
         forget_window(motion)
         return
     for i in range(3):
@@ -155,7 +155,7 @@ def add_sample(state):
 
 @njit
 def forget_window(motion):
-    """Begin anew with the next fix: the window has a hole."""
+    """Begin anew with the next fix: the window has a hole, or readings that do not measure."""
     motion.start_stamp = NEVER
     motion.last_stamp = NEVER
 
