@@ -253,8 +253,10 @@ def is_same_rest(state, settings):
         return True
     n = state.window.samples
     earth = rotate_back(to_matrix(state.attitude), state.frame.earth_rate_map)
-    noise = gyro_density(state, settings) ** 2 / ((state.stamp - state.window.start) * 1e-9)
-    walked = settings.gyro_bias_random_walk**2 * (state.stamp - state.window.still_stamp) * 1e-9
+    passed = (state.stamp - state.window.still_stamp) * 1e-9
+    white = gyro_density(state, settings) ** 2
+    noise = white / ((state.stamp - state.window.start) * 1e-9)
+    walked = settings.gyro_bias_random_walk**2 * passed
     for i in range(3):
         excess = state.window.total[3 + i] / n - state.gyro_bias[i] - earth[i]
         variance = state.covariance[GYRO_BIAS + i, GYRO_BIAS + i] + noise + walked
@@ -262,10 +264,10 @@ def is_same_rest(state, settings):
             return False
     force_map = rotate(to_matrix(state.attitude), force_of_last_half(state))
     sideways = cross(local_up(state), force_map)
-    variance = 0.0
+    bias_variance = 0.0
     for i in range(3):
-        variance = max(variance, state.covariance[GYRO_BIAS + i, GYRO_BIAS + i])
-    variance = variance * ((state.stamp - state.window.still_stamp) * 1e-9 * STANDARD_GRAVITY) ** 2
-    variance += LEAST_FORCE**2 + variance_of_half(state)
-    tolerance = REST_SIGMAS * math.sqrt(variance) + BRAKING_SIGMAS * state.levelling.unseen_braking
+        bias_variance = max(bias_variance, state.covariance[GYRO_BIAS + i, GYRO_BIAS + i])
+    turned = passed * (passed * bias_variance + white)
+    std = math.sqrt(STANDARD_GRAVITY**2 * turned + variance_of_half(state) + LEAST_FORCE**2)
+    tolerance = REST_SIGMAS * std + BRAKING_SIGMAS * state.levelling.unseen_braking
     return math.sqrt(dot(sideways, sideways)) < tolerance
