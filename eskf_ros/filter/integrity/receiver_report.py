@@ -237,14 +237,15 @@ def _velocity_complaints(state: np.void, source: int) -> list[str]:
 
 
 def _may_be_late(state: np.void, source: int) -> bool:
-    """Say whether positions are likely to be stamped late or early, or whether that is not known yet."""
-    installation = state["installation"]
-    late, std = (
-        float(installation["estimate"][source, POSITION_TIME]),
-        float(installation["sigma"][source, POSITION_TIME]),
-    )
+    """Say whether positions or velocities are likely to be stamped late or early.
+
+    So does one who does not know yet how positions are stamped.
+    """
+    estimate, sigma = (state["installation"][name][source] for name in ("estimate", "sigma"))
+    if any(abs(estimate[time]) > max(TIME_ERROR, OPEN_SIGMAS * sigma[time]) for time in (POSITION_TIME, VELOCITY_TIME)):
+        return True
     is_early = int(state["stamp"]) - int(state["first_stamp"]) < LONGEST_COMPARISON
-    return abs(late) > max(TIME_ERROR, OPEN_SIGMAS * std) or (is_early and not 0.0 < std < CERTAIN_TIME_STD)
+    return is_early and not 0.0 < sigma[POSITION_TIME] < CERTAIN_TIME_STD
 
 
 def _may_be_installation(state: np.void, source: int) -> bool:
