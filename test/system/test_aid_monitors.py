@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import re
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from eskf_ros.filter.navigator import Navigator
 from eskf_ros.parameters.mapping import from_mapping
@@ -158,6 +160,20 @@ def test_a_filter_that_is_told_a_better_grade_is_told_which_it_has() -> None:
     ratio, wanted = numbers(sentence)[0], numbers(sentence)[-1]
     assert ratio == pytest.approx(20.0, rel=0.15)
     assert wanted == pytest.approx(2e-4, rel=0.15)
+
+
+def test_first_fixes_after_outages_that_are_further_off_than_expected_are_named() -> None:
+    """As far off as expected they are not; four times as far, the factor is named."""
+    navigator = navigated("drive", 12, POSITION_ONLY, grade="consumer", episodes=OUTAGES)
+    receiver = navigator._states[0]["receiver"]
+    assert receiver["coasts"] == len(OUTAGES)
+    expected = 3 * receiver["coast_nis"]
+    assert chi2.ppf(0.01, 12) < expected < chi2.ppf(0.99, 12)
+    assert navigator.complaints == []
+    receiver["coast_nis"] *= 16.0
+    (sentence,) = navigator.complaints
+    assert "imu.*_noise_density" in sentence
+    assert numbers(sentence) == [4.0, pytest.approx(4.0 * math.sqrt(expected / 12.0), abs=0.05)]
 
 
 def test_a_heading_that_cannot_be_found_is_named_when_the_robot_moves() -> None:
