@@ -82,7 +82,9 @@ def aid_complaints(state: np.void, settings: np.void, is_explained: bool, is_imu
         # One that is not certain for long may do so, too; or axes of the IMU, which take their time.
         is_open = _may_be_installation(state, source) and not _is_implausible(state, source)
         if is_certain and not is_open and not paths and not faults and not lies:
-            found += _velocity_complaints(state, source) + _departure_complaints(state, source)
+            # Velocities are judged by the humble lane, which believes the IMU from one to the next.
+            found += [] if is_imu_doubtful else _velocity_complaints(state, source)
+            found += _departure_complaints(state, source)
     if state["recovery"]["resets"]:
         is_explained = bool(found or given_heading_complaints(state))
         cause = "" if is_explained or not is_certain else f": multipath for many seconds; or {NOISY_IMU}"
