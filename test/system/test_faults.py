@@ -360,10 +360,11 @@ def test_clean_drives_of_the_other_generator_are_complained_of_by_nothing(given:
         ("holes of 1.6 s, last sample repeated", DEFAULT_POSITION),
         ("stamps in bursts of 4", TOLD_VELOCITY),
         ("velocities stamped 0.13 s late", DEFAULT_VELOCITY),
+        ("one gyro axis negated", TOLD_VELOCITY),
     ],
 )
 def test_faults_of_the_other_generator_blame_no_other_cause(name: str, given: Filter, other_drives: Path) -> None:
-    """What does not measure blames no axes, mounting or clocks, uneven stamps no velocities, late ones no multipath."""
+    """What does not measure blames no axes, mounting or clocks, uneven stamps and axes no velocities."""
     fault = BY_NAME[name]
     for seed in range(3):
         figures = figures_of(fault, run_one(fault, recording_from(other_drives, fault, seed), given))

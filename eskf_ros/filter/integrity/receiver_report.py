@@ -82,8 +82,9 @@ def aid_complaints(state: np.void, settings: np.void, is_explained: bool, is_imu
         # One that is not certain for long may do so, too; or axes of the IMU, which take their time.
         is_open = _may_be_installation(state, source) and not _is_implausible(state, source)
         if is_certain and not is_open and not paths and not faults and not lies:
-            # Velocities are judged by the humble lane, which believes the IMU from one to the next.
-            found += [] if is_imu_doubtful else _velocity_complaints(state, source)
+            # Velocities are judged by the estimate, and by what the IMU says from one to the next.
+            if not is_imu_doubtful and not state["recovery"]["resets"]:
+                found += _velocity_complaints(state, source)
             found += _departure_complaints(state, source)
     if state["recovery"]["resets"]:
         is_explained = bool(found or given_heading_complaints(state))
