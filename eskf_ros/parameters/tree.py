@@ -147,7 +147,8 @@ class Imu:
         "rad/s/rtHz",
         "White noise of the gyro as mounted. The default, 0.0859 deg/s/rtHz (5.16 deg/rt h), is for a consumer MEMS "
         "IMU shaken by engine and road; a data sheet says 2e-4 (consumer), 0.5e-4 (industrial), 0.1e-4 and less "
-        "(tactical): use that on a smooth vehicle.",
+        "(tactical): use that on a smooth vehicle. It is measured at rest, too; what is measured is used, and said, "
+        "where it is more than 1.5 times this.",
         above=0.0,
         maximum=1.0,
         live=True,
