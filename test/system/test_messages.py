@@ -163,7 +163,7 @@ def test_quantised_coordinates_of_a_parked_robot_cost_nothing() -> None:
         for begin in range(0, 3000, 10):
             part = slice(begin, begin + 10)
             force = np.tile([0.0, 0.0, 9.8087], (10, 1)) + 0.01 * rng.normal(size=(10, 3))
-            navigator.push_imu(stamps[part], force, 0.001 * rng.normal(size=(10, 3)))
+            navigator.push_imu(stamps[part], force, 3e-4 * rng.normal(size=(10, 3)))
             north, east, up = 0.01 * rng.normal(size=3)
             place = 48.0 + north / 111e3, 11.0 + east / 74e3, 500.0 + up
             if is_rounded:
