@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
@@ -20,7 +21,6 @@ from campaign.running import Trace, heading_at_start_deg, parameters_of, recordi
 from eskf_ros.parameters.mapping import from_mapping
 from faults import all_faults
 from names import follow
-from support.data import find_data_folder
 
 CLEAN = Fault("clean", Kind.CLEAN)
 BY_NAME = {fault.name: fault for fault in all_faults()}
@@ -323,12 +323,9 @@ def test_a_section_of_a_document_is_replaced_and_the_others_stay(tmp_path: Path)
 
 
 @pytest.fixture
-def other_drives() -> Path:
-    """The folder with the drives of the other generator; the test is skipped without it."""
-    try:
-        return find_data_folder(FOLDER)
-    except FileNotFoundError as problem:
-        pytest.skip(str(problem))
+def other_drives(data_folder: Callable[[str], Path]) -> Path:
+    """The folder with the drives of the other generator."""
+    return data_folder(FOLDER)
 
 
 def test_drives_of_the_other_generator_are_what_their_files_say(other_drives: Path) -> None:

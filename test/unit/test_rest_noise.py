@@ -73,7 +73,10 @@ def test_nothing_is_concluded_from_a_few_windows() -> None:
     assert gyro_density(state, settings) == TOLD
 
 
-def test_coarse_readings_that_do_not_change_are_no_noise() -> None:
-    state, settings = standing(np.round(white(TOLD) / 0.05) * 0.05)
-    assert state["gyro_noise"]["density"] == 0.0
+@pytest.mark.parametrize("quantum", [1.0, 3.0, 30.0])
+def test_a_coarse_sensor_is_as_noisy_as_told(quantum: float) -> None:
+    """A resolution of up to three standard deviations adds little; a coarser one hides the noise."""
+    step = quantum * TOLD * math.sqrt(RATE)
+    state, settings = standing(np.round(white(TOLD) / step) * step)
     assert gyro_density(state, settings) == TOLD
+    assert (state["gyro_noise"]["density"] > 0.8 * TOLD) == (quantum < 30.0)

@@ -17,7 +17,7 @@ from eskf_ros.filter.state.error_state import ACCEL_BIAS, ATTITUDE, ERROR_CAPACI
 from eskf_ros.filter.state.time import NEVER
 from eskf_ros.filter.stationarity.quiet_run import has_changed_lately
 from eskf_ros.filter.stationarity.residual_motion import can_be_bias, is_moving, note_sway, variance_of_half
-from eskf_ros.filter.stationarity.seen_motion import unseen_speed, unseen_turn
+from eskf_ros.filter.stationarity.seen_motion import unseen_speed_variance, unseen_turn_variance
 from eskf_ros.filter.stationarity.static_window import Window, force_of_last_half
 from eskf_ros.geodesy.earth import EARTH_RATE, STANDARD_GRAVITY
 from eskf_ros.geodesy.rotation import cross, dot, rotate, rotate_back, to_matrix, wrapped
@@ -178,7 +178,7 @@ def change_of_gravity(state, settings):
         return (0.0, 0.0, 0.0), 0.0
     end, start = force_of_last_half(state), window.still_force
     change = ((end[0] - start[0]) / passed, (end[1] - start[1]) / passed, (end[2] - start[2]) / passed)
-    start_variance = 4.0 * unseen_speed(state) / duration**4
+    start_variance = 4.0 * unseen_speed_variance(state) / duration**4
     square = dot(change, change)
     if square > TURN_SIGMAS**2 * (variance + start_variance + LEAST_TURN**2):
         return change, variance + start_variance
@@ -323,7 +323,7 @@ def update_gyro_bias_at_rest(state, prior_bias, prior, mean_rate, turn_variance,
         horizontal_variance = noise + horizontal_square * settings.initial_heading_std**2
     horizontal_variance += turn_variance
     # A turn that nothing excludes may be what the gyro reads.
-    vertical_variance += unseen_turn(state, has_changed_lately(state))
+    vertical_variance += unseen_turn_variance(state, has_changed_lately(state))
     vertical_gain = prior / (prior + vertical_variance) if is_rest and prior > 0.0 else 0.0
     horizontal_gain = prior / (prior + horizontal_variance) if is_rest and prior > 0.0 else 0.0
     mean_map = rotate(

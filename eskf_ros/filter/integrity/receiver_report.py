@@ -240,10 +240,7 @@ def _velocity_complaints(state: np.void, source: int) -> list[str]:
 
 
 def _may_be_late(state: np.void, source: int) -> bool:
-    """Say whether positions or velocities are likely to be stamped late or early.
-
-    So does one who does not know yet how positions are stamped.
-    """
+    """Say whether positions or velocities are likely to be stamped late or early, or whether it is too early to say."""
     estimate, sigma = (state["installation"][name][source] for name in ("estimate", "sigma"))
     if any(abs(estimate[time]) > max(TIME_ERROR, OPEN_SIGMAS * sigma[time]) for time in (POSITION_TIME, VELOCITY_TIME)):
         return True

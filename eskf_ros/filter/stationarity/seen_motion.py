@@ -254,7 +254,7 @@ def see_yaw(state, stamp, yaw, variance):
 
 
 @njit
-def unseen_turn(state, has_changed):
+def unseen_turn_variance(state, has_changed):
     """Return the mean square ((rad/s)2) of a turn that the sensors do not exclude while the IMU is as quiet as at rest.
 
     It is that which a dual antenna leaves. Without one a robot turns only where its readings change (``has_changed``),
@@ -263,11 +263,11 @@ def unseen_turn(state, has_changed):
     last = state.seen.turn_stamp
     if last != NEVER and state.stamp - last <= LONGEST_TURN:
         return state.seen.turn_rate**2 + state.seen.turn_rate_variance
-    return unseen_speed(state) / TURN_RADIUS**2 if has_changed else 0.0
+    return unseen_speed_variance(state) / TURN_RADIUS**2 if has_changed else 0.0
 
 
 @njit
-def unseen_speed(state):
+def unseen_speed_variance(state):
     """Return the mean square ((m/s)2) of a horizontal speed that the sensors do not exclude.
 
     It is 0 where none of them has spoken: robots start at rest.
