@@ -168,11 +168,12 @@ def test_prediction_and_noise_are_those_of_the_range_model(seed: int, flags: int
     np.testing.assert_allclose(work["innovation"][0], expected["code_residual"] - bias - offset, rtol=0.0, atol=1e-6)
     np.testing.assert_allclose(work["noise"][0, 0], expected["code_std"] ** 2, rtol=1e-12)
     payload[MEASURED] = -300.0
+    state["gyro_noise"]["density"] = shown = 3.0 * settings["gyro_noise_density"]
     range_rate.linearize(state, payload, settings, work)
     np.testing.assert_allclose(work["innovation"][0], expected["doppler_residual"] - drift, rtol=0.0, atol=1e-8)
     lever = turn.apply(arm)
     unit = state["frame"]["map_to_ecef"].T @ expected["line_of_sight"]
-    gyro = settings["gyro_noise_density"] ** 2 / state["imu"]["interval"] * np.sum(np.cross(unit, lever) ** 2)
+    gyro = shown**2 / state["imu"]["interval"] * np.sum(np.cross(unit, lever) ** 2)
     np.testing.assert_allclose(work["noise"][0, 0], expected["doppler_std"] ** 2 + gyro, rtol=1e-9)
 
 

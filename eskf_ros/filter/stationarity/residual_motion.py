@@ -136,11 +136,16 @@ def sway_variance(state, first, noise_density):
     n = state.residual.parts
     if n < FEWEST_PARTS:
         return 0.0
-    white = noise_density**2 / (PART * 1e-9)
     largest = 0.0
     for i in range(first, first + 3):
         largest = max(largest, scatter_of_parts(state, i))
-    return largest if largest > MORE_THAN_NOISE * white else 0.0
+    return beyond_noise(largest, noise_density)
+
+
+@njit
+def beyond_noise(variance, noise_density):
+    """Return a variance of the means of parts; 0 if white noise explains it."""
+    return variance if variance > MORE_THAN_NOISE * noise_density**2 / (PART * 1e-9) else 0.0
 
 
 @njit
@@ -172,11 +177,16 @@ def variance_of_half(state):
 
 @njit
 def note_sway(state, is_first, settings):
-    """Keep the largest residual motion in a run of still windows; ``is_first``: this window is the first of the run."""
+    """Keep the largest residual motion in a run of still windows; ``is_first``: this window is the first of the run.
+
+    What has passed for motion in windows before may be noise of the gyros, which has been measured since.
+    """
+    density = gyro_density(state, settings)
     force = sway_variance(state, 0, settings.accel_noise_density)
-    rate = sway_variance(state, 3, gyro_density(state, settings))
+    rate = sway_variance(state, 3, density)
+    before = beyond_noise(state.residual.rate_variance, density)
     state.residual.force_variance = force if is_first else max(state.residual.force_variance, force)
-    state.residual.rate_variance = rate if is_first else max(state.residual.rate_variance, rate)
+    state.residual.rate_variance = rate if is_first else max(before, rate)
 
 
 @njit
